@@ -1,0 +1,52 @@
+# `make demo` and `make test` need only Python >= 3.11 and make.
+PYTHON ?= python3
+VENV   ?= .venv
+BIN    := $(VENV)/bin
+JOBS   ?= 2
+
+# Compiled programs are kept between runs: compiling is most of the time of a short one.
+export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
+export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
+
+.PHONY: help demo test slow lint types docs wheel check clean
+.DEFAULT_GOAL := help
+
+help:  ## list the commands
+	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
+
+$(VENV)/.run: pyproject.toml
+	@echo "== installing what a run needs into $(VENV)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -e .
+	@touch $@
+
+$(VENV)/.dev: pyproject.toml
+	@echo "== installing what tests, lint and docs need into $(VENV)"
+	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
+	@$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[dev]'
+	@touch $@ $(VENV)/.run
+
+test: $(VENV)/.dev  ## install what the tests need and run the default suite (<= 15 min on two cores)
+	@echo "== running the default test suite on $(JOBS) workers"
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
+
+slow: $(VENV)/.dev  ## the tests that take minutes each
+	$(BIN)/python -m pytest -m slow
+
+lint: $(VENV)/.dev  ## ruff: style and errors
+	$(BIN)/ruff check .
+	$(BIN)/ruff format --check .
+
+types: $(VENV)/.dev  ## mypy over the packages and the scripts
+	$(BIN)/mypy
+
+docs: $(VENV)/.dev  ## build the documentation into site/
+	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
+
+wheel: $(VENV)/.dev  ## build the wheel and import it from outside the repository
+	$(BIN)/python scripts/check_wheel.py
+
+check: lint types docs test  ## everything that CI runs
+
+clean:  ## remove what the other commands made, but not runs/ or results/
+	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

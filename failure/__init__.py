@@ -1,0 +1,3 @@
+"""Rare-failure search for analog and mixed-signal circuits."""
+
+__all__: list[str] = []

@@ -1,0 +1,345 @@
+"""Make maps on the host: checked obstacles, and random maps that a robot can solve.
+
+:func:`make_map` turns polygons and circles into :class:`jaxsnn.world.Params` and refuses a map that
+no robot could run on, before anything is compiled. :func:`random_map` draws maps until the planner
+can solve one.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Key
+
+from jaxsnn import geometry
+from jaxsnn.planner import Obstacles, path_field
+from jaxsnn.world import N_SONARS, Params
+
+__all__ = ["make_map", "random_map", "stack_maps"]
+
+Polygon = Sequence[Sequence[float]]
+
+
+def _positive(name: str, value: float, *, zero: bool = False) -> float:
+    if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
+        kind = "a finite number >= 0" if zero else "a finite number > 0"
+        raise ValueError(f"{name} = {value} must be {kind}")
+    return float(value)
+
+
+def _rows(name: str, values: Any, width: int) -> np.ndarray:
+    """Values as float64 ``[n, width]``, n = 0 allowed."""
+    rows = (
+        np.asarray(values, np.float64).reshape(-1, width) if len(values) else np.zeros((0, width))
+    )
+    if not np.isfinite(rows).all():
+        raise ValueError(f"{name} holds a value that is not finite: {rows.tolist()}")
+    return rows
+
+
+def _pad(name: str, rows: np.ndarray, size: int, fill: float = 0.0) -> np.ndarray:
+    if len(rows) > size:
+        raise ValueError(f"{name}: {len(rows)} of them, but max_{name} = {size}; raise it")
+    padding = np.full((size - len(rows), *rows.shape[1:]), fill)
+    return np.concatenate([rows, padding])
+
+
+def make_map(
+    polygons: Sequence[Polygon] = (),
+    circles: Sequence[Sequence[float]] = (),
+    *,
+    bounds: Sequence[float] = (0.0, 0.0, 800.0, 600.0),
+    target: Sequence[float],
+    starts: Sequence[Sequence[float]],
+    start_probs: Sequence[float] | None = None,
+    arrival_radius: float = 35.0,
+    heading_spread: float = 45.0,
+    speed: float = 15.0,
+    robot_radius: float = 6.0,
+    sonar_angles: Sequence[float] = (60.0, 30.0, 0.0, -30.0, -60.0),
+    sonar_range: float = 300.0,
+    distance_range: float = 800.0,
+    polygon_velocity: Sequence[Sequence[float]] | None = None,
+    circle_velocity: Sequence[Sequence[float]] | None = None,
+    patrol_steps: int = 1,
+    sonar_noise: float = 0.0,
+    distance_noise: float = 0.0,
+    angle_noise: float = 0.0,
+    sonar_stuck: dict[int, float] | None = None,
+    max_segments: int = 40,
+    max_circles: int = 8,
+    max_starts: int = 2,
+) -> Params:
+    """A checked map, padded so that maps of different obstacles share one compiled program.
+
+    Args:
+        polygons: obstacles as corners (x, y) in order around them [px]; they may be concave.
+        circles: round obstacles (x, y, radius) [px].
+        bounds: walls (x0, y0, x1, y1) [px].
+        target: (x, y) [px].
+        starts: start circles (x, y, radius) [px].
+        start_probs: how often each start circle is drawn; equal shares by default.
+        arrival_radius: the robot's centre within this of the target has arrived [px].
+        heading_spread: start headings are towards the target plus or minus this [deg].
+        speed: path per control step [px].
+        robot_radius: radius of the disc robot [px].
+        sonar_angles: directions of the sonars from the heading, leftmost first [deg].
+        sonar_range: range of the sonars [px].
+        distance_range: range of the distance sensor [px].
+        polygon_velocity: motion of each polygon [px per step]; all stand still by default.
+        circle_velocity: motion of each circle [px per step].
+        patrol_steps: whole steps after which moving obstacles turn back.
+        sonar_noise: standard deviation of each sonar [px].
+        distance_noise: standard deviation of the distance sensor [px].
+        angle_noise: standard deviation of the angle sensor [deg].
+        sonar_stuck: failed sonars, ``{index: what it reports [px]}``.
+        max_segments: room for sides of polygons.
+        max_circles: room for circles.
+        max_starts: room for start circles.
+
+    Returns:
+        Params, float32.
+
+    Raises:
+        ValueError: a degenerate polygon, an obstacle outside the walls, a start circle in which the
+            robot would touch an obstacle or already stand at the target, a target that cannot be
+            reached, or a constant out of range. The message names the value and the fix.
+    """
+    walls = _rows("bounds", bounds, 4)
+    if len(walls) != 1 or walls[0, 0] >= walls[0, 2] or walls[0, 1] >= walls[0, 3]:
+        raise ValueError(f"bounds {list(bounds)} must be (x0, y0, x1, y1) with x0 < x1 and y0 < y1")
+    x0, y0, x1, y1 = walls[0]
+    shapes = [geometry.check_polygon(p, f"polygon {i}") for i, p in enumerate(polygons)]
+    rounds = _rows("circles", circles, 3)
+    for i, shape in enumerate(shapes):
+        if (shape < [x0, y0]).any() or (shape > [x1, y1]).any():
+            raise ValueError(f"polygon {i} leaves the walls {walls[0].tolist()}; clip it to them")
+    for i, (cx, cy, r) in enumerate(rounds):
+        _positive(f"radius of circle {i}", r)
+        if not (x0 <= cx <= x1 and y0 <= cy <= y1):
+            raise ValueError(f"circle {i} has its centre ({cx:g}, {cy:g}) outside the walls")
+    for name, value in (
+        ("arrival_radius", arrival_radius),
+        ("speed", speed),
+        ("robot_radius", robot_radius),
+        ("sonar_range", sonar_range),
+        ("distance_range", distance_range),
+    ):
+        _positive(name, value)
+    for name, value in (
+        ("heading_spread", heading_spread),
+        ("sonar_noise", sonar_noise),
+        ("distance_noise", distance_noise),
+        ("angle_noise", angle_noise),
+    ):
+        _positive(name, value, zero=True)
+    if patrol_steps != int(patrol_steps) or patrol_steps < 1:
+        raise ValueError(f"patrol_steps = {patrol_steps} must be a whole number of steps >= 1")
+    if len(sonar_angles) != N_SONARS or not np.isfinite(sonar_angles).all():
+        raise ValueError(f"sonar_angles {list(sonar_angles)} must be {N_SONARS} finite angles")
+    goal = _rows("target", target, 2)
+    begin = _rows("starts", starts, 3)
+    if not len(begin) or (begin[:, 2] < 0).any():
+        raise ValueError(f"starts {begin.tolist()} must be at least one (x, y, radius >= 0)")
+    probs = np.full(len(begin), 1.0) if start_probs is None else np.asarray(start_probs, np.float64)
+    if probs.shape != (len(begin),) or not (probs >= 0).all() or not probs.sum() > 0:
+        raise ValueError(
+            f"start_probs {probs.tolist()} must be one number >= 0 for each of the {len(begin)} "
+            "start circles, not all zero"
+        )
+    failed, stuck = np.zeros(N_SONARS, bool), np.zeros(N_SONARS)
+    for index, value in (sonar_stuck or {}).items():
+        if not 0 <= index < N_SONARS or not 0.0 <= value <= sonar_range:
+            raise ValueError(
+                f"sonar_stuck {{{index}: {value}}} must name a sonar 0..{N_SONARS - 1} and a value "
+                f"in [0, {sonar_range:g}]"
+            )
+        failed[index], stuck[index] = True, value
+
+    def velocities(name: str, given: Sequence[Sequence[float]] | None, n: int) -> np.ndarray:
+        rows = np.zeros((n, 2)) if given is None else _rows(name, given, 2)
+        if len(rows) != n:
+            raise ValueError(f"{name} has {len(rows)} rows for {n} obstacles; give one for each")
+        return rows
+
+    drift = velocities("polygon_velocity", polygon_velocity, len(shapes))
+    roll = velocities("circle_velocity", circle_velocity, len(rounds))
+    sides = [geometry.polygon_segments(shape) for shape in shapes]
+    segments = np.concatenate(sides) if sides else np.zeros((0, 4))
+    repeats = [len(side) for side in sides]
+    side_drift = np.repeat(drift, repeats, axis=0) if sides else np.zeros((0, 2))
+
+    def floats(values: Any) -> Array:
+        return jnp.asarray(np.asarray(values), jnp.float32)
+
+    params = Params(
+        segments=floats(_pad("segments", segments, max_segments)),
+        segment_mask=jnp.arange(max_segments) < len(segments),
+        circles=floats(_pad("circles", rounds, max_circles)),
+        circle_mask=jnp.arange(max_circles) < len(rounds),
+        bounds=floats(walls[0]),
+        target=floats(goal[0]),
+        arrival_radius=floats(arrival_radius),
+        starts=floats(_pad("starts", begin, max_starts)),
+        start_probs=floats(_pad("starts", probs / probs.sum(), max_starts)),
+        heading_spread=floats(heading_spread),
+        speed=floats(speed),
+        robot_radius=floats(robot_radius),
+        sonar_angles=floats(sonar_angles),
+        sonar_range=floats(sonar_range),
+        distance_range=floats(distance_range),
+        segment_velocity=floats(_pad("segments", side_drift, max_segments)),
+        circle_velocity=floats(_pad("circles", roll, max_circles)),
+        patrol_steps=floats(patrol_steps),
+        sonar_noise=floats(sonar_noise),
+        distance_noise=floats(distance_noise),
+        angle_noise=floats(angle_noise),
+        sonar_failed=jnp.asarray(failed),
+        sonar_stuck=floats(stuck),
+    )
+    _check_starts(params, segments, rounds, begin, goal[0], probs)
+    return params
+
+
+def _check_starts(
+    params: Params,
+    segments: np.ndarray,
+    circles: np.ndarray,
+    starts: np.ndarray,
+    target: np.ndarray,
+    probs: np.ndarray,
+) -> None:
+    """Every start is free and leads to the target; moving obstacles count where they begin."""
+    everything = Obstacles(segments, circles, np.asarray(params.bounds, np.float64))
+    radius = float(params.robot_radius)
+    room = float(everything.clearance(target[None], target[None])[0])
+    if room <= 0:
+        raise ValueError(
+            f"target {target.tolist()} lies inside an obstacle or wall and is unreachable; move it"
+        )
+    field = path_field(params)
+    for i, ((x, y, r), p) in enumerate(zip(starts, probs, strict=True)):
+        centre = np.array([[x, y]])
+        room = float(everything.clearance(centre, centre)[0])
+        if room < r + radius:
+            raise ValueError(
+                f"start circle {i} at ({x:g}, {y:g}) of radius {r:g} lets the robot (radius "
+                f"{radius:g}) start inside an obstacle or wall: {room:.1f} px are free around its "
+                f"centre, {r + radius:g} are needed; move or shrink it"
+            )
+        gap = float(np.hypot(*(centre[0] - target)))
+        if gap - r <= float(params.arrival_radius):
+            raise ValueError(
+                f"start circle {i} at ({x:g}, {y:g}) reaches into the target's arrival circle; "
+                "move one of them or make arrival_radius smaller"
+            )
+        if p > 0 and not math.isfinite(field.lengths(centre)[0]):
+            raise ValueError(
+                f"target {target.tolist()} is unreachable from start circle {i} at ({x:g}, {y:g}) "
+                f"for a robot of radius {radius:g}; open a gap between the obstacles"
+            )
+
+
+def stack_maps(maps: Sequence[Params]) -> Params:
+    """Maps of equal padding as one Params with a leading axis, ready for ``jax.vmap``."""
+    if not maps:
+        raise ValueError("stack_maps needs at least one map, got none")
+    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *maps)
+
+
+def random_map(
+    key: Key[Array, ""],
+    *,
+    n_obstacles: tuple[int, int] = (4, 8),
+    obstacle_radius: tuple[float, float] = (25.0, 55.0),
+    size: tuple[float, float] = (800.0, 600.0),
+    min_distance: float = 250.0,
+    start_radius: float = 30.0,
+    clearance: float = 20.0,
+    attempts: int = 1000,
+    **constants: Any,
+) -> Params:
+    """A random map that a robot can solve: triangles to hexagons and circles, one start, one
+    target.
+
+    Args:
+        key: typed PRNG key; the same key gives the same map.
+        n_obstacles: fewest and most obstacles.
+        obstacle_radius: smallest and largest radius of the circle around an obstacle [px].
+        size: width and height of the walled plane [px].
+        min_distance: least distance between the start circle's centre and the target [px].
+        start_radius: radius of the start circle [px].
+        clearance: a path that keeps this distance from everything must exist [px].
+        attempts: draws before giving up.
+        **constants: passed on to :func:`make_map`.
+
+    Returns:
+        Params with the padding of :func:`make_map`.
+
+    Raises:
+        ValueError: no solvable map within ``attempts``, or the ranges are impossible.
+    """
+    if not 0 <= n_obstacles[0] <= n_obstacles[1]:
+        raise ValueError(
+            f"n_obstacles = {n_obstacles} must be (fewest, most) with 0 <= fewest <= most"
+        )
+    if not 0 < obstacle_radius[0] <= obstacle_radius[1]:
+        raise ValueError(f"obstacle_radius = {obstacle_radius} must be (smallest, largest), > 0")
+    rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
+    arrival = float(constants.get("arrival_radius", 35.0))
+    margin = 2.0 * clearance + start_radius
+    if min(size) <= 2.0 * margin:
+        raise ValueError(
+            f"size = {size} leaves no room for a start circle {margin:g} px from walls"
+        )
+    low, high = np.full(2, margin), np.asarray(size) - margin
+    for _ in range(attempts):
+        target = rng.uniform(low, high)
+        start = rng.uniform(low, high)
+        if np.hypot(*(target - start)) < min_distance:
+            continue
+        polygons: list[Polygon] = []
+        circles: list[Sequence[float]] = []
+        taken = [(*start, start_radius + clearance), (*target, arrival + clearance)]
+        for _ in range(int(rng.integers(n_obstacles[0], n_obstacles[1] + 1))):
+            radius = float(rng.uniform(*obstacle_radius))
+            centre = rng.uniform(np.full(2, radius), np.asarray(size) - radius)
+            if any(math.hypot(centre[0] - x, centre[1] - y) < radius + r for x, y, r in taken):
+                continue
+            corners = int(rng.integers(2, 7))
+            if corners == 2:
+                circles.append((*centre, radius))
+            else:
+                phase = rng.uniform(0, 2 * np.pi)
+                steps = (np.arange(corners) + rng.uniform(-0.25, 0.25, corners)) / corners
+                angles = phase + 2 * np.pi * steps
+                ring = np.stack([np.cos(angles), np.sin(angles)], axis=1)
+                polygons.append((centre + radius * ring).tolist())
+            # Obstacles may touch: only start and target must stay clear, the planner judges the
+            # rest.
+        if len(polygons) + len(circles) < n_obstacles[0]:
+            continue
+        try:
+            params = make_map(
+                polygons,
+                circles,
+                bounds=(0.0, 0.0, *size),
+                target=target.tolist(),
+                starts=[(*start, start_radius)],
+                **constants,
+            )
+        except ValueError as error:
+            if "unreachable" not in str(error):
+                raise
+            continue
+        if math.isfinite(path_field(params, clearance=clearance).lengths(start[None])[0]):
+            return params
+    raise ValueError(
+        f"no solvable map in {attempts} attempts with n_obstacles = {n_obstacles} and "
+        f"min_distance = {min_distance}; ask for fewer or smaller obstacles"
+    )

@@ -64,8 +64,8 @@ class Protocol:
             raise ValueError(f"n_channels is {k}, expected at least 1")
         if not 0 <= self.low <= self.high <= k:
             raise ValueError(
-                f"failing channels from {self.low} to {self.high}: expected 0 <= low <= high <= {k} "
-                "(the number of channels)"
+                f"failing channels from {self.low} to {self.high}: expected "
+                f"0 <= low <= high <= {k}, the number of channels"
             )
         if not 0.0 <= self.clean_fraction <= 1.0:
             raise ValueError(

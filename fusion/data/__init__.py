@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 from fusion.data.dataset import (
     Dataset,
     Scale,
@@ -25,8 +27,15 @@ from fusion.data.fixed import (
     published_fixed,
 )
 from fusion.data.har import HAR_CHANNELS, HAR_CLASSES, load_har
+from fusion.data.simulated import (
+    SimulatedConfig,
+    bayes_accuracy,
+    load_simulated,
+    oracle_accuracy,
+)
 
 __all__ = [
+    "DATASETS",
     "DRIVER_CHANNELS",
     "DRIVER_CLASSES",
     "DRIVER_FIXED_CLEAN",
@@ -37,13 +46,67 @@ __all__ = [
     "HAR_FIXED_FAILING",
     "Dataset",
     "Scale",
+    "SimulatedConfig",
     "apply_scale",
+    "bayes_accuracy",
     "check_dataset",
     "draw_groups",
     "fit_scale",
     "fixed_sets",
+    "load",
     "load_driver",
     "load_har",
+    "load_simulated",
+    "oracle_accuracy",
     "published_fixed",
     "validation_split",
 ]
+
+# Ways to split each set into training and test rows, the default first.
+DATASETS: dict[str, tuple[str, ...]] = {
+    "har": ("subject",),
+    "driver": ("random", "trip"),
+    "simulated": ("subject",),
+}
+
+
+def load(
+    name: str,
+    data_dir: str | Path | None = None,
+    *,
+    download: bool = False,
+    split: str | None = None,
+    seed: int = 0,
+) -> Dataset:
+    """Load a data set by name.
+
+    Args:
+        name: `har`, `driver` or `simulated`.
+        data_dir: folder or file to look at first; then `$FUSION_DATA_DIR` and the user cache.
+        download: fetch the set from its publisher when it is nowhere (`har` only).
+        split: how test rows are taken, one of `DATASETS[name]`; None = the first of them.
+        seed: of the simulated values, or of the draw of the driver's test rows.
+
+    Returns:
+        The set, scaled to [-1, 1] by training statistics.
+
+    Raises:
+        ValueError: unknown name or split (the message lists the known ones), or a damaged file.
+        FileNotFoundError: the set is nowhere; the message lists the ways to get it.
+
+    Example:
+        >>> load("simulated").channels[:2]
+        ('sensor_0', 'sensor_1')
+    """
+    if name not in DATASETS:
+        raise ValueError(f"data set {name!r} is unknown, expected one of {list(DATASETS)}")
+    split = DATASETS[name][0] if split is None else split
+    if split not in DATASETS[name]:
+        raise ValueError(
+            f"split {split!r} is unknown for {name!r}, expected one of {list(DATASETS[name])}"
+        )
+    if name == "har":
+        return load_har(data_dir, download=download)
+    if name == "driver":
+        return load_driver(data_dir, split="trip" if split == "trip" else "random", seed=seed)
+    return load_simulated(seed=seed)

@@ -199,8 +199,8 @@ def draw_groups(
     for pool in pools:
         if pool.size < 2:
             raise ValueError(
-                f"group {pool[0]} alone holds class {labels[groups == pool[0]][0]}: it cannot be in "
-                "both parts; split by rows instead"
+                f"group {pool[0]} alone holds class {labels[groups == pool[0]][0]}: it cannot be "
+                "in both parts; split by rows instead"
             )
         count = min(max(1, round(fraction * pool.size)), pool.size - 1)
         chosen.extend(rng.choice(pool, size=count, replace=False).tolist())

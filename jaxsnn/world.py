@@ -24,7 +24,7 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxsnn import geometry
 
@@ -37,6 +37,7 @@ __all__ = [
     "State",
     "observe",
     "observe_many",
+    "obstacles_at",
     "reset",
     "step",
     "step_many",
@@ -117,8 +118,10 @@ def _patrol(t: Array, params: Params) -> Array:
     return period - jnp.abs(jnp.mod(t.astype(period.dtype), 2.0 * period) - period)
 
 
-def _obstacles(t: Array, params: Params) -> tuple[Array, Array]:
-    """Segments and circles where they are at step t."""
+def obstacles_at(
+    t: Int[Array, ""], params: Params
+) -> tuple[Float[Array, "s 4"], Float[Array, "c 3"]]:
+    """Segments and circles where they are after ``t`` control steps, padding included."""
     steps = _patrol(t, params)
     shift = params.segment_velocity * steps
     segments = params.segments + jnp.concatenate([shift, shift], axis=1)
@@ -185,7 +188,7 @@ def observe(state: State, params: Params, *, others: Discs | None = None) -> Rea
     the car is lost.
     """
     position = jnp.stack([state.x, state.y])
-    segments, circles = _obstacles(state.t, params)
+    segments, circles = obstacles_at(state.t, params)
 
     def sonar(direction: Array) -> Array:
         seen = [
@@ -271,7 +274,7 @@ def step(
     position = jnp.stack([state.x, state.y])
     finite = jnp.isfinite(steering) & jnp.isfinite(state.heading) & jnp.all(jnp.isfinite(position))
     heading, move = _heading_and_move(state, steering, params)
-    segments, circles = _obstacles(state.t, params)
+    segments, circles = obstacles_at(state.t, params)
     gone = _patrol(state.t + 1, params) - _patrol(state.t, params)
 
     contacts = [

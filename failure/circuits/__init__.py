@@ -1,0 +1,28 @@
+"""Circuits that are really simulated: a batched solver in JAX, two circuits, ngspice beside it."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+from failure.circuits.ldo import ldo
+from failure.circuits.protocol import Circuit, Spec
+
+__all__ = ["CIRCUITS", "Circuit", "Spec", "get", "ldo"]
+
+CIRCUITS: dict[str, Callable[[], Circuit]] = {"ldo": ldo}
+"""Name -> function that makes the circuit."""
+
+
+def get(name: str) -> Circuit:
+    """A circuit by name.
+
+    Args:
+        name: a key of `CIRCUITS`.
+    Returns:
+        Circuit; the same object at every call.
+    Raises:
+        ValueError: unknown name.
+    """
+    if name not in CIRCUITS:
+        raise ValueError(f"unknown circuit {name!r}; known: {', '.join(CIRCUITS)}")
+    return CIRCUITS[name]()

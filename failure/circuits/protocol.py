@@ -1,0 +1,135 @@
+"""What a circuit offers to a search: dimensions, box, specifications, one function."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field
+from functools import cached_property
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int
+
+__all__ = ["CHUNK", "Circuit", "Spec", "in_chunks"]
+
+CHUNK = 64
+"""Samples that are solved side by side; a batch this wide keeps the solver in the cache."""
+
+
+class Spec(NamedTuple):
+    """One specification; a sample fails when the value is above (sense "max") its threshold."""
+
+    name: str
+    unit: str
+    sense: str
+    description: str
+
+
+@dataclass(frozen=True, eq=False)
+class Circuit:
+    """A circuit under parameter variation.
+
+    `simulate(x)` maps `x [n, d]`, in units of sigma, to `(specs [n, m] float64, status [n] int)`;
+    status 0 is a converged sample, anything else is neither a pass nor a failure. It computes in
+    float64 whatever the caller's setting, and may be jitted, mapped and differentiated inside
+    `jax.enable_x64(True)`.
+    """
+
+    name: str
+    parameter_names: tuple[tuple[str, str], ...]
+    """(transistor, quantity) of every dimension."""
+    sigma: tuple[float, ...]
+    """One sigma of every dimension, relative or in volts, as `parameter_units` says."""
+    parameter_units: tuple[str, ...]
+    specs: tuple[Spec, ...]
+    run: Callable[[Array], tuple[Array, Array]] = field(repr=False)
+    """The pure function behind `simulate`; call it with float64 inside `jax.enable_x64(True)`."""
+    reference: Callable[..., tuple[np.ndarray, np.ndarray]] = field(repr=False)
+    """The same samples by ngspice: `reference(x, **options) -> (specs, status)`."""
+    box: float = 3.0
+    _jit: Any = field(init=False, repr=False)
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "_jit", jax.jit(self.run))
+
+    @property
+    def n_dims(self) -> int:
+        """Number of parameters."""
+        return len(self.parameter_names)
+
+    @property
+    def bounds(self) -> tuple[np.ndarray, np.ndarray]:
+        """Corners (lo, hi) of the parameter box in sigma."""
+        hi = np.full(self.n_dims, self.box)
+        return -hi, hi
+
+    @cached_property
+    def nominal(self) -> np.ndarray:
+        """Specifications at x = 0, `[m]`."""
+        specs, _ = self.simulate(np.zeros((1, self.n_dims)))
+        return np.asarray(specs)[0]
+
+    @property
+    def spec_names(self) -> tuple[str, ...]:
+        """Names of the specifications, in the order of the columns."""
+        return tuple(s.name for s in self.specs)
+
+    def spec_index(self, name: str) -> int:
+        """Column of a specification.
+
+        Raises:
+            ValueError: no such specification.
+        """
+        if name not in self.spec_names:
+            raise ValueError(
+                f"unknown specification {name!r} of circuit {self.name!r}; known: "
+                f"{', '.join(self.spec_names)}"
+            )
+        return self.spec_names.index(name)
+
+    def simulate(self, x: Float[Any, "n d"]) -> tuple[Float[Array, "n m"], Int[Array, "n"]]:
+        """Specifications and status of a batch of samples.
+
+        Args:
+            x: parameters in sigma.
+        Returns:
+            (specs `[n, m]` float64, status `[n]`).
+        Raises:
+            ValueError: wrong shape.
+        """
+        if x.ndim != 2 or x.shape[1] != self.n_dims:
+            raise ValueError(
+                f"circuit {self.name!r} takes x of shape [n, {self.n_dims}], got {x.shape}"
+            )
+        with jax.enable_x64(True):
+            out: tuple[Array, Array] = self._jit(jnp.asarray(x, jnp.float64))
+            return out
+
+
+def in_chunks(
+    solve: Callable[[Float[Array, "d b"]], tuple[Float[Array, "m b"], Int[Array, "b"]]],
+    x: Float[Array, "n d"],
+    *,
+    chunk: int = CHUNK,
+) -> tuple[Float[Array, "n m"], Int[Array, "n"]]:
+    """Run a batch-last solver over `x [n, d]` in equal chunks, so that n costs no new shapes inside.
+
+    Args:
+        solve: `[d, b] -> (specs [m, b], status [b])`.
+        x: samples.
+        chunk: batch of one chunk; the last is filled with copies of the last sample.
+    Returns:
+        (specs `[n, m]`, status `[n]`).
+    """
+    n, d = x.shape
+    chunk = min(chunk, n)
+    count = -(-n // chunk)
+    padded = jnp.concatenate([x, jnp.broadcast_to(x[-1:], (count * chunk - n, d))])
+    blocks = padded.reshape(count, chunk, d).transpose(0, 2, 1)
+    specs, status = jax.lax.map(solve, blocks)
+    return (
+        specs.transpose(0, 2, 1).reshape(count * chunk, -1)[:n],
+        status.reshape(count * chunk)[:n],
+    )

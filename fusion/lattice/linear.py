@@ -16,6 +16,7 @@ from fusion.lattice.projections import (
     dykstra,
     order_closure,
     order_depth,
+    pair_projections,
     repair_order,
     tilt,
 )
@@ -229,11 +230,7 @@ def project(params: LinearParams, config: LinearConfig, *, margin: float = MARGI
     else:
         width, closure = order
         strict = closure & ~np.eye(len(closure), dtype=bool)
-        # Only direct pairs: those that no third element separates.
-        direct = strict & ~((strict.astype(int) @ strict.astype(int)) > 0)
-        sets: list[Callable[[Array], Array]] = [
-            _half_space(int(low), int(high), width) for low, high in np.argwhere(direct)
-        ]
+        sets: list[Callable[[Array], Array]] = pair_projections(closure, width)
         sets.append((lambda v: _simplex(v, links)) if simplex else clip)
         v = clip(dykstra(v, sets, config.n_iterations))
         # Repair in u = w * width, where dominance is a partial order; then keep a slack that
@@ -251,19 +248,6 @@ def project(params: LinearParams, config: LinearConfig, *, margin: float = MARGI
         equal = jnp.asarray(links / links.sum(1, keepdims=True), v.dtype)
         v = jnp.where(total > 1e-12, v / jnp.maximum(total, 1e-12), equal)
     return LinearParams(v * sign, params.bias)
-
-
-def _half_space(low: int, high: int, width: np.ndarray) -> Callable[[Array], Array]:
-    """Projection onto `v[high] * width[high] >= v[low] * width[low]`."""
-    normal = np.zeros((1, len(width)))
-    normal[0, high], normal[0, low] = width[high], -width[low]
-    normal /= np.linalg.norm(normal)
-
-    def project_pair(v: Array) -> Array:
-        n = jnp.asarray(normal, v.dtype)
-        return v - jnp.minimum(jnp.sum(v * n, axis=-1, keepdims=True), 0.0) * n
-
-    return project_pair
 
 
 def _simplex(v: Array, links: np.ndarray) -> Array:

@@ -14,12 +14,24 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
-__all__ = ["MARGIN", "dykstra", "isotonic", "order_closure", "order_depth", "repair_order", "tilt"]
+__all__ = [
+    "MARGIN",
+    "dykstra",
+    "isotonic",
+    "order_closure",
+    "order_depth",
+    "pair_projections",
+    "repair_order",
+    "tilt",
+]
 
 # `project` leaves this slack, in units of float32 epsilon times the largest parameter. An optax
 # update is a difference, and `params + (projected - params)` is off by about one unit: the slack
 # (about 2e-6) is what keeps the violation at exactly zero after `optax.apply_updates`.
 MARGIN = 16.0
+
+# Longest axis for which `isotonic` is written out; chosen by timing 5 to 20 on one CPU thread.
+_UNROLLED = 16
 
 
 def tilt(values: Float[Array, "*shape"], margin: float) -> Float[Array, ""]:
@@ -55,23 +67,29 @@ def isotonic(values: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*s
     n = values.shape[axis]
     if n == 1:
         return values
-    x = jnp.moveaxis(values, axis, -1)
-    if n == 2:
-        mean = 0.5 * (x[..., :1] + x[..., 1:])
-        y = jnp.concatenate([jnp.minimum(x[..., :1], mean), jnp.maximum(x[..., 1:], mean)], -1)
-        return jnp.moveaxis(y, -1, axis)
-    first, last = np.arange(n)[:, None], np.arange(n)[None, :]
-    count = np.maximum(last - first + 1, 1)
-    sums = jnp.cumsum(x, axis=-1)
+    x = jnp.moveaxis(values, axis, 0)
+    sums = jnp.cumsum(x, axis=0)
     before = sums - x
     lead = (1,) * (x.ndim - 1)
-    means = (sums[..., None, :] - before[..., :, None]) / jnp.asarray(
-        count.reshape(*lead, n, n), x.dtype
+    if n <= _UNROLLED:
+        # From the last position to the first, keep the smallest mean of every start j. On a CPU
+        # this is about ten times as fast as the scan below, which compiles faster for long axes.
+        smallest: Array | None = None
+        y: list[Array] = []
+        for i in reversed(range(n)):
+            count = np.arange(i + 1, 0, -1).reshape(i + 1, *lead)
+            means = (sums[i : i + 1] - before[: i + 1]) * jnp.asarray(1 / count, x.dtype)
+            smallest = means if smallest is None else jnp.minimum(smallest[: i + 1], means)
+            y.append(jnp.max(smallest, axis=0))
+        return jnp.moveaxis(jnp.stack(y[::-1]), 0, axis)
+    start, stop = np.indices((n, n))
+    valid = jnp.broadcast_to(
+        jnp.asarray((stop >= start).reshape(n, n, *lead)), (n, n, *x.shape[1:])
     )
-    upper = jnp.broadcast_to(jnp.asarray((last >= first).reshape(*lead, n, n)), means.shape)
-    smallest = lax.cummin(jnp.where(upper, means, jnp.inf), axis=means.ndim - 1, reverse=True)
-    y = jnp.max(jnp.where(upper, smallest, -jnp.inf), axis=-2)
-    return jnp.moveaxis(y, -1, axis)
+    count = np.maximum(stop - start + 1, 1).reshape(n, n, *lead)
+    means = (sums[None] - before[:, None]) * jnp.asarray(1 / count, x.dtype)
+    after = lax.cummin(jnp.where(valid, means, jnp.inf), axis=1, reverse=True)
+    return jnp.moveaxis(jnp.max(jnp.where(valid, after, -jnp.inf), axis=0), 0, axis)
 
 
 def dykstra(
@@ -148,6 +166,56 @@ def order_depth(closure: np.ndarray) -> np.ndarray:
     for _ in range(n):
         depth = np.max(np.where(strict, depth[:, None] + 1, 0), axis=0, initial=0)
     return depth
+
+
+def pair_projections(
+    closure: np.ndarray, width: np.ndarray | None = None
+) -> list[Callable[[Array], Array]]:
+    """Projections onto the half-spaces `v[i] * width[i] <= v[j] * width[j]` of a partial order.
+
+    Only direct neighbours in the order count, the rest follows. Pairs that share no element are
+    projected at once, so that Dykstra's algorithm has few sets to go through.
+
+    Args:
+        closure: from `order_closure`.
+        width: positive factor of each element; 1 without it.
+
+    Returns:
+        Functions from `[..., n]` to `[..., n]`.
+    """
+    n = len(closure)
+    width = np.ones(n) if width is None else width
+    strict = (closure & ~np.eye(n, dtype=bool)).astype(int)
+    direct = (strict > 0) & (strict @ strict == 0)
+    groups: list[list[tuple[int, int]]] = []
+    for low, high in np.argwhere(direct).tolist():
+        for group in groups:
+            if not any({low, high} & set(pair) for pair in group):
+                group.append((low, high))
+                break
+        else:
+            groups.append([(low, high)])
+    return [_pairs(group, width) for group in groups]
+
+
+def _pairs(group: list[tuple[int, int]], width: np.ndarray) -> Callable[[Array], Array]:
+    n = len(width)
+    partner, role = np.arange(n), np.zeros(n)
+    for low, high in group:
+        partner[low], partner[high] = high, low
+        role[low], role[high] = 1.0, -1.0
+    gain = width / (width**2 + width[partner] ** 2)
+
+    def project(v: Array) -> Array:
+        lead = (1,) * (v.ndim - 1)
+        own, sign, step = (
+            jnp.asarray(a.reshape(*lead, n), v.dtype) for a in (width, role, role * gain)
+        )
+        scaled = v * own
+        excess = jnp.maximum(sign * (scaled - scaled[..., partner]), 0.0)
+        return v - step * excess
+
+    return project
 
 
 def repair_order(values: Float[Array, "*batch n"], closure: np.ndarray) -> Float[Array, "*batch n"]:

@@ -222,9 +222,15 @@ def project(params: PWLParams, config: PWLConfig, *, margin: float = MARGIN) -> 
     lift = slack * jnp.asarray(rank, y.dtype)
     y = y - lift
     if np.any(signs):
-        direction = jnp.asarray(np.where(signs < 0, -1, 1), y.dtype)
-        bound = jnp.asarray(np.broadcast_to(signs != 0, y.shape))
-        y = jnp.where(bound, isotonic(y * direction) * direction, y)
+        # Only the rows from the first monotone input to the last: put them side by side.
+        monotone = np.flatnonzero(config.signs)
+        rows = slice(int(monotone[0]), int(monotone[-1]) + 1)
+        part, bound = y[rows], signs[rows]
+        direction = jnp.asarray(np.where(bound < 0, -1, 1), y.dtype)
+        ordered = isotonic(part * direction) * direction
+        if not bound.all():
+            ordered = jnp.where(np.broadcast_to(bound != 0, part.shape), ordered, part)
+        y = jnp.concatenate([y[: rows.start], ordered, y[rows.stop :]])
     y = _clip(y, config, slack, jnp.asarray(last * np.abs(signs), y.dtype)) + lift
     missing = params.missing
     if missing is not None:

@@ -1,0 +1,173 @@
+"""Categorical calibrator: one learned output for each category, with a partial order."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Int, Key
+
+from fusion.lattice.projections import (
+    MARGIN,
+    dykstra,
+    order_closure,
+    order_depth,
+    pair_projections,
+    repair_order,
+    tilt,
+)
+
+__all__ = ["CategoricalConfig", "CategoricalParams", "apply", "check", "init", "project"]
+
+
+class CategoricalParams(NamedTuple):
+    """`outputs` `[n_categories]`; `missing` `[]`, or `None` where no category is missing."""
+
+    outputs: Array
+    missing: Array | None = None
+
+
+@dataclasses.dataclass(frozen=True)
+class CategoricalConfig:
+    """A calibrator of one categorical input.
+
+    Attributes:
+        n_categories: categories `0..n_categories - 1`.
+        order: pairs `(low, high)` of categories: the output of the first is at most that of the
+            second. Any pairs without a circle; what follows from them holds too.
+        output_range: `(low, high)`, either of which may be `None`.
+        missing_value: an integer outside the categories that stands for a missing input, with a
+            learned output of its own.
+        n_iterations: passes of Dykstra's algorithm where pairs share categories.
+    """
+
+    n_categories: int
+    order: tuple[tuple[int, int], ...] = ()
+    output_range: tuple[float | None, float | None] = (None, None)
+    missing_value: int | None = None
+    n_iterations: int = 20
+
+    def __post_init__(self) -> None:
+        """Refuse sizes, ranges and orders that mean nothing."""
+        if self.n_categories < 1:
+            raise ValueError(f"n_categories is {self.n_categories}; expected at least 1")
+        low, high = self.output_range
+        if low is not None and high is not None and not low < high:
+            raise ValueError(f"output_range is {self.output_range}; expected low < high")
+        missing = self.missing_value
+        if missing is not None and 0 <= missing < self.n_categories:
+            raise ValueError(
+                f"missing_value is {missing}, which is a category; expected a value outside "
+                f"0..{self.n_categories - 1}, for example -1"
+            )
+        _ = self.closure
+
+    @property
+    def closure(self) -> np.ndarray:
+        """`[i, j]` is true where the output of i must not exceed that of j."""
+        return order_closure(self.order, self.n_categories)
+
+
+def init(key: Key[Array, ""], config: CategoricalConfig) -> CategoricalParams:
+    """Outputs drawn uniformly from the output range, then projected onto the order.
+
+    Args:
+        key: PRNG key.
+        config: the calibrator.
+
+    Returns:
+        CategoricalParams; feasible.
+    """
+    low, high = config.output_range
+    if low is None:
+        low = 0.0 if high is None else high - 1.0
+    if high is None:
+        high = low + 1.0
+    outputs = jax.random.uniform(key, (config.n_categories,), minval=low, maxval=high)
+    missing = None if config.missing_value is None else jnp.asarray(0.5 * (low + high), jnp.float32)
+    return project(CategoricalParams(outputs, missing), config)
+
+
+def apply(
+    params: CategoricalParams, config: CategoricalConfig, x: Int[Array, "*batch"]
+) -> Float[Array, "*batch"]:
+    r"""The output of each category.
+
+    .. math:: c(x) = \sum_i \theta_i \, [x = i]
+
+    Args:
+        params: of the calibrator.
+        config: of the calibrator.
+        x: categories. One that is neither known nor `missing_value` gives NaN.
+
+    Returns:
+        The calibrated inputs.
+
+    Example:
+        >>> params = CategoricalParams(jnp.array([0.0, 10.0, 20.0]))
+        >>> apply(params, CategoricalConfig(3), jnp.array([2, 0])).tolist()
+        [20.0, 0.0]
+    """
+    categories = jnp.arange(config.n_categories, dtype=x.dtype)
+    chosen = x[..., None] == categories.reshape((1,) * x.ndim + (-1,))
+    outputs = params.outputs.reshape((1,) * x.ndim + (-1,))
+    y = jnp.sum(jnp.where(chosen, outputs, 0.0), axis=-1)
+    y = jnp.where(jnp.any(chosen, axis=-1), y, jnp.nan)
+    if config.missing_value is not None and params.missing is not None:
+        y = jnp.where(x == config.missing_value, params.missing, y)
+    return y
+
+
+def project(
+    params: CategoricalParams, config: CategoricalConfig, *, margin: float = MARGIN
+) -> CategoricalParams:
+    """The nearest outputs that satisfy order and bounds, by Dykstra and an exact last step.
+
+    Args:
+        params: of the calibrator.
+        config: of the calibrator.
+        margin: slack to leave, in float32 epsilons of the largest output; 0 for none.
+
+    Returns:
+        CategoricalParams with `check(...) == 0`.
+    """
+    y = params.outputs
+    closure = config.closure
+    depth = order_depth(closure)
+    slack = tilt(y, margin)
+    lift = slack * jnp.asarray(depth, y.dtype)
+    y = y - lift
+    sets = pair_projections(closure)
+    if sets:
+        y = repair_order(dykstra(y, sets, config.n_iterations), closure)
+    y = _clip(y, config, slack, float(depth.max())) + lift
+    missing = params.missing
+    if missing is not None:
+        missing = _clip(missing, config, slack, 0.0)
+    return CategoricalParams(y, missing)
+
+
+def _clip(y: Array, config: CategoricalConfig, slack: Array, depth: float) -> Array:
+    low, high = config.output_range
+    if low is not None:
+        y = jnp.maximum(y, low + slack)
+    if high is not None:
+        y = jnp.minimum(y, high - slack * (depth + 1.0))
+    return y
+
+
+def check(params: CategoricalParams, config: CategoricalConfig) -> Float[Array, ""]:
+    """Largest violation of order and bounds; 0 where all hold."""
+    y = params.outputs
+    gap = jnp.where(config.closure, y[:, None] - y[None, :], 0.0)
+    worst = jnp.maximum(jnp.max(gap), 0.0)
+    low, high = config.output_range
+    for values in (y, params.missing):
+        if values is not None and low is not None:
+            worst = jnp.maximum(worst, low - jnp.min(values))
+        if values is not None and high is not None:
+            worst = jnp.maximum(worst, jnp.max(values) - high)
+    return worst

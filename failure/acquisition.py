@@ -1,0 +1,243 @@
+"""Where to simulate next: log expected improvement, confidence bound, pBO's weighted family.
+
+The search maximises: a larger specification value is worse for the circuit.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Key
+
+from failure import gp
+from failure.optimize import Domain, bfgs, project, sample
+
+__all__ = [
+    "ACQUISITIONS",
+    "AcquisitionConfig",
+    "acquisition_value",
+    "confidence_bound",
+    "log_ei",
+    "log_h",
+    "pbo_weights",
+    "propose",
+    "raw_points",
+    "weighted",
+]
+
+ACQUISITIONS = ("log_ei", "lcb", "pbo")
+
+_HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
+
+
+@dataclass(frozen=True)
+class AcquisitionConfig:
+    """Which acquisition, and how hard to search for its maximum.
+
+    ``n_raw`` random points are ranked, the best ``n_restarts`` are improved by at most
+    ``max_evals`` evaluations each. Half of the raw points lie around the best inputs so far: in
+    60 dimensions uniform points almost never start an ascent that ends well.
+    """
+
+    name: str = "log_ei"
+    batch_size: int = 1
+    beta: float = 2.0
+    n_raw: int = 512
+    n_restarts: int = 8
+    max_evals: int = 60
+
+    def __post_init__(self) -> None:
+        """Refuse unknown names and a batch for acquisitions that have one maximum."""
+        if self.name not in ACQUISITIONS:
+            raise ValueError(f"acquisition={self.name!r}: expected one of {ACQUISITIONS}")
+        if self.batch_size < 1 or (self.batch_size > 1 and self.name != "pbo"):
+            raise ValueError(
+                f"batch_size={self.batch_size} with {self.name!r}: expected 1; only 'pbo' has a "
+                "family of acquisition functions to fill a batch"
+            )
+        if not 1 <= self.n_restarts <= self.n_raw:
+            raise ValueError(
+                f"n_restarts={self.n_restarts}: expected 1 ... n_raw={self.n_raw}; lower it"
+            )
+
+
+@jax.custom_jvp
+def log_h(z: Float[Array, "..."]) -> Float[Array, "..."]:
+    r"""Stable logarithm of the unit expected improvement.
+
+    .. math:: h(z) = \phi(z) + z \Phi(z)
+
+    For z > -1 directly; down to -25 through :math:`\log(1 + z \Phi / \phi)`; below by the
+    asymptotic series :math:`z^{-2} - 3 z^{-4} + 15 z^{-6} - \dots`. Finite and with a useful
+    slope where ``h`` underflows.
+
+    Source: Ament et al. (2023), Equation 9. Deviation: ``log_ndtr`` in the place of ``erfcx``.
+
+    Example:
+        >>> round(float(log_h(jnp.asarray(0.0))), 4)
+        -0.9189
+    """
+    log_phi = -0.5 * z * z - _HALF_LOG_2PI
+    high = jnp.maximum(z, -1.0)
+    phi_high = jnp.exp(-0.5 * high * high - _HALF_LOG_2PI)
+    direct = jnp.log(phi_high + high * jax.scipy.stats.norm.cdf(high))
+    mid = jnp.clip(z, -25.0, -1.0)
+    ratio = jnp.exp(jax.scipy.special.log_ndtr(mid) + 0.5 * mid * mid + _HALF_LOG_2PI)
+    middle = log_phi + jnp.log1p(mid * ratio)
+    low = jnp.minimum(z, -25.0)
+    q = 1.0 / (low * low)
+    series = 1.0 - q * (3.0 - q * (15.0 - q * (105.0 - q * (945.0 - q * 10395.0))))
+    far = log_phi + jnp.log(q) + jnp.log(series)
+    return jnp.where(z > -1.0, direct, jnp.where(z > -25.0, middle, far))
+
+
+@log_h.defjvp
+def _log_h_jvp(primals: tuple[Array,], tangents: tuple[Array,]) -> tuple[Array, Array]:
+    (z,), (dz,) = primals, tangents
+    value = log_h(z)
+    # h' = Phi, so the slope of log h is Phi / h: no cancellation at any z.
+    return value, jnp.exp(jax.scipy.special.log_ndtr(z) - value) * dz
+
+
+def log_ei(
+    mean: Float[Array, "..."], sd: Float[Array, "..."], best: Float[Array, ""]
+) -> Float[Array, "..."]:
+    r"""Log expected improvement over ``best``: :math:`\log h((\mu - y^*) / \sigma) + \log\sigma`.
+
+    Source: Ament et al. (2023), Equation 8.
+    """
+    return log_h((mean - best) / sd) + jnp.log(sd)
+
+
+def confidence_bound(
+    mean: Float[Array, "..."], sd: Float[Array, "..."], beta: float
+) -> Float[Array, "..."]:
+    r"""Optimistic bound :math:`\mu + \beta \sigma` (the LCB of a minimisation, sign turned).
+
+    Source: Srinivas et al. (2010), Equation 6, with :math:`\beta = \sqrt{\beta_t}` held fixed.
+    """
+    return mean + beta * sd
+
+
+def weighted(
+    mean: Float[Array, "..."], sd: Float[Array, "..."], weight: Float[Array, "..."]
+) -> Float[Array, "..."]:
+    r"""One member of pBO's family: :math:`(1 - w) \mu + w \sigma`.
+
+    Source: Hu, Li and Huang (2018), sign turned for maximisation.
+    """
+    return (1.0 - weight) * mean + weight * sd
+
+
+def pbo_weights(batch_size: int) -> Float[Array, " q"]:
+    """Weights spread evenly over [0, 1], ends included; one half for a batch of one.
+
+    Example:
+        >>> pbo_weights(3).tolist()
+        [0.0, 0.5, 1.0]
+    """
+    if batch_size == 1:
+        return jnp.asarray([0.5])
+    return jnp.linspace(0.0, 1.0, batch_size)
+
+
+def acquisition_value(
+    config: AcquisitionConfig,
+    mean: Float[Array, "..."],
+    sd: Float[Array, "..."],
+    best: Float[Array, ""],
+    weight: Float[Array, "..."],
+) -> Float[Array, "..."]:
+    """The configured acquisition at a predicted mean and standard deviation."""
+    if config.name == "log_ei":
+        return log_ei(mean, sd, best)
+    if config.name == "lcb":
+        return confidence_bound(mean, sd, config.beta)
+    return weighted(mean, sd, weight)
+
+
+def raw_points(
+    domain: Domain, centres: Float[Array, "c d"], key: Key[Array, ""], n_raw: int
+) -> Float[Array, "r d"]:
+    """Candidate starts: uniform points, and the best inputs with some coordinates drawn afresh.
+
+    Args:
+        domain: where to look.
+        centres: the best inputs so far.
+        key: random key.
+        n_raw: how many; half of them around the centres.
+
+    Returns:
+        The points, inside the domain.
+
+    Source: the coordinate mask (twenty drawn afresh on average) is that of TuRBO's candidates,
+    Eriksson et al. (2019), Section 3.1.
+    """
+    key_fresh, key_mask, key_reach = jax.random.split(key, 3)
+    fresh = sample(domain, key_fresh, n_raw)
+    n_local = n_raw // 2
+    centre = jnp.tile(centres, (-(-n_local // centres.shape[0]), 1))[:n_local]
+    chosen = jax.random.bernoulli(key_mask, min(1.0, 20.0 / fresh.shape[1]), centre.shape)
+    reach = jax.random.uniform(key_reach, (n_local, 1), fresh.dtype)
+    moved = jnp.where(chosen, centre + reach * (fresh[:n_local] - centre), centre)
+    return jnp.concatenate([jax.vmap(project, (None, 0))(domain, moved), fresh[n_local:]])
+
+
+def propose(
+    gp_config: gp.GPConfig,
+    config: AcquisitionConfig,
+    posterior: gp.Posterior,
+    domain: Domain,
+    best: Float[Array, ""],
+    raw: Float[Array, "r d"],
+) -> tuple[Float[Array, "q d"], Float[Array, " q"]]:
+    """Maximise the acquisition by multi-start ascent; one program, every start a lane.
+
+    Args:
+        gp_config: the surrogate's configuration.
+        config: acquisition and effort.
+        posterior: the conditioned GP.
+        domain: where to look.
+        best: best (standardised) output so far.
+        raw: candidate starts, from :func:`raw_points`.
+
+    Returns:
+        ``(points [q, d], acquisition values [q])``.
+    """
+    weights = pbo_weights(config.batch_size).astype(posterior.x.dtype)
+
+    def value(x: Array, weight: Array) -> Array:
+        mean, variance = gp.predict(gp_config, posterior, x)
+        return acquisition_value(config, mean, jnp.sqrt(variance), best, weight)
+
+    mean, variance = gp.predict(gp_config, posterior, raw)
+    sd = jnp.sqrt(variance)
+    scores = jax.vmap(lambda w: acquisition_value(config, mean, sd, best, w))(weights)
+    _, top = jax.lax.top_k(scores, config.n_restarts)
+    starts = raw[top.reshape(-1)]
+    lane_weights = jnp.repeat(weights, config.n_restarts)
+
+    def ascend(start: Array, weight: Array) -> tuple[Array, Array]:
+        def loss(x: Array) -> Array:
+            return -value(x[None], weight)[0]
+
+        end = bfgs(
+            lambda x: (*jax.value_and_grad(loss)(x), ()),
+            start,
+            domain,
+            max_evals=config.max_evals,
+            gtol=1e-6,
+            ftol=1e-7,
+        )
+        return end.x, -end.value
+
+    points, values = jax.vmap(ascend)(starts, lane_weights)
+    points = points.reshape(config.batch_size, config.n_restarts, -1)
+    values = values.reshape(config.batch_size, config.n_restarts)
+    values = jnp.where(jnp.isfinite(values), values, -jnp.inf)
+    winner = jnp.argmax(values, 1)
+    rows = jnp.arange(config.batch_size)
+    return points[rows, winner], values[rows, winner]

@@ -1,0 +1,465 @@
+"""Search for failures: one ask/tell loop for every search space, many seeds side by side.
+
+State lives on the host as numpy arrays with a leading seed axis; the numerical work is a few
+jitted programs mapped over the seeds. Asking is deterministic in (config, history), so a run can
+be killed at any point and goes on from its log.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, field, replace
+from functools import lru_cache, partial
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from failure import acquisition, baselines, gp, gp_fit, turbo
+from failure.embeddings import (
+    FullSpace,
+    Space,
+    Task,
+    decode,
+    encode,
+    initial_design,
+    random_embedding,
+    search_domain,
+    task_domain,
+    unit_scale,
+)
+from failure.optimize import Domain
+
+__all__ = [
+    "METHODS",
+    "Method",
+    "SearchConfig",
+    "SearchState",
+    "Surrogate",
+    "ask",
+    "best_so_far",
+    "first_hit",
+    "init",
+    "tell",
+]
+
+
+@dataclass(frozen=True)
+class Method:
+    """A named combination: search space, acquisition, batch, trust region; or a baseline."""
+
+    space: str
+    acquisition: str = "log_ei"
+    batch_size: int = 1
+    kernel: str = "matern52"
+    trust_region: bool = False
+    label: str = ""
+
+
+METHODS: dict[str, Method] = {
+    "monte_carlo": Method("none", label="Monte Carlo"),
+    "ridge_corner": Method("none", label="ridge + worst corner"),
+    "gradient_corner": Method("none", label="gradient + corner"),
+    "pbo": Method("full", "pbo", 5, label="pBO"),
+    "hdbo": Method("random", label="HDBO"),
+    "full": Method("full", label="full-space GP"),
+    "full_linear": Method("full", kernel="linear", label="full-space linear kernel"),
+    "turbo": Method("full", trust_region=True, label="TuRBO"),
+    "rev_argate_zeros": Method("zeros", label="Rev-ARGate zeros"),
+    "rev_argate_bnn": Method("bnn", label="Rev-ARGate BNN"),
+}
+
+
+@dataclass(frozen=True)
+class SearchConfig:
+    """What defines a search: task, method, seeds and budget (50 + 250, as in the source).
+
+    ``refit_every`` counts evaluations between fits of the hyper-parameters once there are more
+    than ``2 n_init`` of them; in between points are appended to the factorisation.
+    """
+
+    task: Task
+    method: str = "full"
+    seeds: tuple[int, ...] = (0,)
+    n_init: int = 50
+    n_total: int = 300
+    embedding_dim: int | None = None
+    retrain_every: int = 0
+    refit_every: int = 2
+    gp: gp.GPConfig = field(default_factory=gp.GPConfig)
+    acquisition: acquisition.AcquisitionConfig = field(
+        default_factory=acquisition.AcquisitionConfig
+    )
+    turbo: turbo.TurboConfig = field(default_factory=turbo.TurboConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse unknown methods and impossible budgets; complete the method's choices."""
+        if self.method not in METHODS:
+            raise ValueError(f"unknown method {self.method!r}; known methods: {', '.join(METHODS)}")
+        if not 2 <= self.n_init <= self.n_total:
+            raise ValueError(
+                f"n_init={self.n_init}, n_total={self.n_total}: expected 2 <= n_init <= n_total"
+            )
+        if len(self.seeds) == 0 or len(set(self.seeds)) != len(self.seeds):
+            raise ValueError(f"seeds={self.seeds}: expected at least one, all different")
+        if self.refit_every < 1:
+            raise ValueError(f"refit_every={self.refit_every}: expected at least 1")
+        task_domain(self.task)
+        method = METHODS[self.method]
+        dim = self.embedding_dim
+        if method.space in ("random", "zeros", "bnn"):
+            dim = dim or max(1, round(0.37 * self.task.dim))
+            if not 1 <= dim <= self.task.dim:
+                raise ValueError(f"embedding_dim={dim}: expected 1 ... {self.task.dim}")
+        else:
+            dim = None
+        # Frozen: the resolved choices replace the given ones once, here.
+        object.__setattr__(self, "embedding_dim", dim)
+        object.__setattr__(self, "gp", replace(self.gp, kernel=method.kernel))
+        object.__setattr__(
+            self,
+            "acquisition",
+            replace(self.acquisition, name=method.acquisition, batch_size=method.batch_size),
+        )
+
+
+class Surrogate(NamedTuple):
+    """Hyper-parameters of the last fit per seed, its curvature, and the count it was made at."""
+
+    params: Any
+    hessian_inverse: Any
+    n_fit: int
+
+
+class SearchState(NamedTuple):
+    """History with a leading seed axis ``S``; ``n`` evaluations are complete, the rest is asked.
+
+    Attributes:
+        x: ``[S, n, D]`` parameters in sigma.
+        u: ``[S, n, d]`` unit coordinates of the search space (empty for baselines).
+        y: ``[S, n]`` outputs; NaN where the simulator gave none.
+        status: ``[S, n]``; 0 valid.
+        clipped: ``[S, n]`` share of coordinates that restoration put outside the set.
+        pending: ``(x, u, clipped)`` that wait for :func:`tell`, or None.
+        space: the search space, stacked over seeds; None until it is known.
+        space_at: evaluations the space was made from.
+        surrogate: of the last ask, or None.
+        posterior: the conditioned GPs of the last ask; a cache that can be rebuilt.
+    """
+
+    x: np.ndarray
+    u: np.ndarray
+    y: np.ndarray
+    status: np.ndarray
+    clipped: np.ndarray
+    pending: tuple[np.ndarray, np.ndarray, np.ndarray] | None = None
+    space: Any = None
+    space_at: int = 0
+    surrogate: Surrogate | None = None
+    posterior: Any = None
+
+    @property
+    def n(self) -> int:
+        """Complete evaluations per seed."""
+        return self.y.shape[1]
+
+
+TrainSpace = Callable[[SearchConfig, Any, np.ndarray, np.ndarray], Space]
+
+
+def init(config: SearchConfig) -> SearchState:
+    """An empty history."""
+    s, dim = len(config.seeds), config.task.dim
+    empty = np.zeros((s, 0))
+    return SearchState(
+        np.zeros((s, 0, dim)), np.zeros((s, 0, 0)), empty, empty.astype(np.int64), empty
+    )
+
+
+def _keys(config: SearchConfig, n: int) -> Any:
+    """One key per seed for the iteration that follows ``n`` evaluations."""
+    keys = [jax.random.fold_in(jax.random.key(seed), n) for seed in config.seeds]
+    return jnp.stack(keys)
+
+
+@lru_cache(maxsize=64)
+def _programs(config: SearchConfig) -> dict[str, Any]:
+    """The jitted programs of a search, each mapped over the seeds; shapes are bound at call."""
+
+    def mapped(f: Callable[..., Any]) -> Any:
+        return jax.jit(lambda *args: jax.lax.map(lambda a: f(*a), args))
+
+    def fit(x: Any, y: Any, n: Any, params: Any, h: Any, fresh: Any) -> Any:
+        return gp_fit.fit(config.gp, x, y, n, params, h, fresh)
+
+    def raw(domain: Domain, centres: Any, key: Any) -> Any:
+        return acquisition.raw_points(domain, centres, key, config.acquisition.n_raw)
+
+    def decode_block(space: Space, u: Any) -> Any:
+        return jax.vmap(partial(decode, space, task_domain(config.task)))(u)
+
+    return {
+        "fit": mapped(fit),
+        "condition": mapped(partial(gp.condition, config.gp)),
+        "append": mapped(partial(gp.append, config.gp)),
+        "raw": mapped(raw),
+        "propose": mapped(partial(acquisition.propose, config.gp, config.acquisition)),
+        "decode": jax.jit(jax.vmap(decode_block)),
+        "encode": jax.jit(jax.vmap(lambda space, x: jax.vmap(partial(encode, space))(x))),
+        "region": jax.jit(jax.vmap(turbo.trust_region)),
+    }
+
+
+def _program_key(config: SearchConfig) -> SearchConfig:
+    """Programs depend neither on the seeds nor on the budget, so runs share them."""
+    return replace(config, seeds=(0,), n_init=2, n_total=2, refit_every=1)
+
+
+def _stack(tree: Any, count: int) -> Any:
+    return jax.tree.map(lambda leaf: jnp.stack([leaf] * count), tree)
+
+
+def _first_space(config: SearchConfig) -> Any:
+    """The space that needs no data, or None."""
+    kind = METHODS[config.method].space
+    if kind == "full":
+        return _stack(FullSpace(jnp.asarray(unit_scale(config.task))), len(config.seeds))
+    if kind == "random":
+        dim = config.embedding_dim or 1
+        # 2**31 - 1: a stream of its own, away from the iterations'.
+        keys = [jax.random.fold_in(jax.random.key(s), 2**31 - 1) for s in config.seeds]
+        spaces = [random_embedding(key, config.task, dim) for key in keys]
+        return jax.tree.map(lambda *leaves: jnp.stack(leaves), *spaces)
+    return None
+
+
+def _initial(config: SearchConfig, state: SearchState) -> SearchState:
+    """The initial design: uniform in the search space, or in x where that is not known yet."""
+    keys = _keys(config, 0)
+    space = _first_space(config)
+    drawn_from: Any = space
+    if space is None:
+        drawn_from = _stack(FullSpace(jnp.asarray(unit_scale(config.task))), len(config.seeds))
+    one = jax.tree.map(lambda leaf: leaf[0], drawn_from)
+    u = jax.vmap(lambda key: initial_design(one, config.task, key, config.n_init))(keys)
+    x, clipped = _programs(_program_key(config))["decode"](drawn_from, u)
+    pending = (np.asarray(x), np.asarray(u), np.asarray(clipped))
+    return state._replace(pending=pending, space=space)
+
+
+def _baseline(config: SearchConfig, state: SearchState) -> SearchState:
+    """The next points of a method without a surrogate."""
+    n_left = config.n_total - state.n
+    blocks = []
+    for row, seed in enumerate(config.seeds):
+        rng = np.random.default_rng([seed, state.n])
+        x, y = state.x[row], state.y[row]
+        if config.method == "monte_carlo":
+            blocks.append(baselines.monte_carlo(rng, config.task, n_left))
+        elif config.method == "gradient_corner":
+            blocks.append(baselines.gradient_corner(rng, config.task, x, y, n_left))
+        elif state.n == 0:
+            blocks.append(baselines.uniform(rng, config.task, config.n_init))
+        else:
+            blocks.append(baselines.ridge_corner(rng, config.task, x, y))
+    x = np.stack(blocks)
+    return state._replace(pending=(x, np.zeros((*x.shape[:2], 0)), np.zeros(x.shape[:2])))
+
+
+def _targets(state: SearchState, size: int) -> tuple[np.ndarray, np.ndarray]:
+    """Standardised outputs, padded to ``size``, and the best valid one per seed.
+
+    An invalid evaluation gets the mean of the valid ones: the surrogate then knows that the place
+    has been tried, and neither seeks nor shuns it.
+    """
+    y = np.zeros((state.y.shape[0], size))
+    best = np.zeros(state.y.shape[0])
+    for row, values in enumerate(state.y):
+        good = np.isfinite(values)
+        if not good.any():
+            continue
+        mean = values[good].mean()
+        sd = values[good].std(ddof=1) if good.sum() > 1 else 0.0
+        sd = sd if sd > 1e-12 * (1.0 + abs(mean)) else 1.0
+        y[row, : state.n] = np.where(good, (values - mean) / sd, 0.0)
+        best[row] = y[row, : state.n][good].max()
+    return y, best
+
+
+def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
+    """Fit hyper-parameters: from the last ones where there are any, else from the priors' mode."""
+    fit = _programs(_program_key(config))["fit"]
+    seeds, dim = len(config.seeds), x.shape[2]
+    count = jnp.full((seeds,), state.n, jnp.int32)
+    old = state.surrogate
+    result = None
+    if old is None or gp.padded_size(old.n_fit) != gp.padded_size(state.n):
+        start = _stack(gp_fit.initial_params(config.gp, dim), seeds)
+        eye = _stack(jnp.eye(dim + 1), seeds)
+        result = fit(x, y, count, start, eye, jnp.ones((seeds,), bool))
+    if old is not None:
+        cold_start = jnp.zeros((seeds,), bool)
+        warm = fit(x, y, count, old.params, old.hessian_inverse, cold_start)
+        if result is None:
+            result = warm
+        else:
+            # At every new padded size a cold fit checks the warm one for a better optimum.
+            better = warm.value >= result.value
+
+            def pick(a: Any, b: Any) -> Any:
+                return jnp.where(better.reshape((-1,) + (1,) * (a.ndim - 1)), a, b)
+
+            result = jax.tree.map(pick, warm, result)
+    assert result is not None
+    return Surrogate(result.params, result.hessian_inverse, state.n)
+
+
+def _surrogate_ask(config: SearchConfig, state: SearchState) -> SearchState:
+    """Fit or append, then maximise the acquisition for all seeds."""
+    programs = _programs(_program_key(config))
+    n, s = state.n, len(config.seeds)
+    q = config.acquisition.batch_size
+    size = gp.padded_size(n)
+    y_host, best_host = _targets(state, size)
+    x_host = np.zeros((s, size, state.u.shape[2]))
+    x_host[:, :n] = state.u
+    x, y, best = jnp.asarray(x_host), jnp.asarray(y_host), jnp.asarray(best_host)
+    surrogate = state.surrogate
+    step = 1 if n <= 2 * config.n_init else config.refit_every
+    posterior = state.posterior
+    if surrogate is None or n - surrogate.n_fit >= step:
+        surrogate = _fit(config, state, x, y)
+        posterior = None
+    if posterior is None or posterior.x.shape[1] != size or q > 1:
+        # Conditioned as it was at the fit, then grown point by point: the same numbers whether
+        # the run was interrupted in between or not.
+        at_fit = jnp.full((s,), surrogate.n_fit, jnp.int32)
+        posterior = programs["condition"](surrogate.params, x, y, at_fit)
+        grown = surrogate.n_fit
+    else:
+        grown = int(posterior.n[0])
+    for row in range(grown, n):
+        posterior = programs["append"](posterior, x[:, row], y)
+    order = np.argsort(-np.where(np.isfinite(state.y), state.y, -np.inf), axis=1)[:, :4]
+    centres = jnp.asarray(np.take_along_axis(state.u, order[:, :, None], axis=1))
+    domain = _stack(_unit_domain(config, state), s)
+    if METHODS[config.method].trust_region:
+        dim = state.u.shape[2]
+        lengths = [turbo.region_length(config.turbo, row, config.n_init, dim) for row in state.y]
+        domain = programs["region"](
+            domain, centres[:, 0], jnp.asarray(lengths), surrogate.params.log_lengthscale
+        )
+    raw = programs["raw"](domain, centres, _keys(config, n))
+    u, _ = programs["propose"](posterior, domain, best, raw)
+    u = u[:, : config.n_total - n]
+    new_x, clipped = programs["decode"](state.space, u)
+    pending = (np.asarray(new_x), np.asarray(u), np.asarray(clipped))
+    return state._replace(pending=pending, surrogate=surrogate, posterior=posterior)
+
+
+def _unit_domain(config: SearchConfig, state: SearchState) -> Domain:
+    space = jax.tree.map(lambda leaf: leaf[0], state.space)
+    return search_domain(space, config.task)
+
+
+def _learn_space(config: SearchConfig, state: SearchState, train: TrainSpace | None) -> SearchState:
+    """Train Rev-ARGate on all evaluations so far; its features re-describe the whole history."""
+    if train is None:
+        from failure.rev_argate import train_space
+
+        train = train_space
+    keys = _keys(config, state.n)
+    space = train(config, keys, state.x, state.y)
+    u = _programs(_program_key(config))["encode"](space, jnp.asarray(state.x))
+    return state._replace(
+        space=space, space_at=state.n, u=np.asarray(u), surrogate=None, posterior=None
+    )
+
+
+def ask(
+    config: SearchConfig, state: SearchState, *, train: TrainSpace | None = None
+) -> tuple[np.ndarray, SearchState]:
+    """The next points to simulate.
+
+    Args:
+        config: the search.
+        state: history; points that are already asked are returned again.
+        train: how Rev-ARGate spaces are trained; :func:`failure.rev_argate.train_space` without.
+
+    Returns:
+        ``(x [S, q, D] in sigma, state)``.
+
+    Raises:
+        ValueError: the budget is spent.
+    """
+    if state.pending is not None:
+        return state.pending[0], state
+    if state.n >= config.n_total:
+        raise ValueError(
+            f"all {config.n_total} simulations are spent; raise n_total for a longer search"
+        )
+    method = METHODS[config.method]
+    with jax.enable_x64(True):
+        if method.space == "none":
+            state = _baseline(config, state)
+        elif state.n == 0:
+            state = _initial(config, state)
+        else:
+            if method.space in ("zeros", "bnn"):
+                due = config.retrain_every and state.n - state.space_at >= config.retrain_every
+                if state.space is None or due:
+                    state = _learn_space(config, state, train)
+            state = _surrogate_ask(config, state)
+    assert state.pending is not None
+    return state.pending[0], state
+
+
+def tell(
+    config: SearchConfig, state: SearchState, y: np.ndarray, status: np.ndarray | None = None
+) -> SearchState:
+    """Add the outputs of the points that were asked.
+
+    Args:
+        config: the search.
+        state: with pending points ``[S, q, D]``.
+        y: ``[S, q]``, larger is worse; a value that is not finite counts as invalid.
+        status: ``[S, q]``, 0 where valid; all zero without.
+
+    Raises:
+        ValueError: nothing was asked, or the shape is another.
+    """
+    if state.pending is None:
+        raise ValueError("tell without points that wait for an answer; call ask first")
+    x, u, clipped = state.pending
+    y = np.asarray(y, np.float64)
+    if y.shape != x.shape[:2]:
+        raise ValueError(f"y has shape {y.shape}: expected {x.shape[:2]}, one value per point")
+    flags = np.zeros(y.shape, np.int64) if status is None else np.asarray(status, np.int64)
+    flags = np.where((flags == 0) & ~np.isfinite(y), -1, flags)
+    y = np.where(flags == 0, y, np.nan)
+    old_u = state.u if state.n else np.zeros((*u.shape[:1], 0, u.shape[2]))
+    return state._replace(
+        x=np.concatenate([state.x, x], 1),
+        u=np.concatenate([old_u, u], 1),
+        y=np.concatenate([state.y, y], 1),
+        status=np.concatenate([state.status, flags], 1),
+        clipped=np.concatenate([state.clipped, clipped], 1),
+        pending=None,
+    )
+
+
+def best_so_far(y: np.ndarray) -> np.ndarray:
+    """Running worst case ``[S, n]``; -inf before the first valid evaluation."""
+    return np.maximum.accumulate(np.where(np.isfinite(y), y, -np.inf), axis=1)
+
+
+def first_hit(y: np.ndarray, threshold: float) -> np.ndarray:
+    """Simulations up to and with the first failure (``y > threshold``) per seed, NaN for none.
+
+    Example:
+        >>> first_hit(np.array([[0.0, 2.0, 3.0], [0.0, 0.0, 1.0]]), 1.5).tolist()
+        [2.0, nan]
+    """
+    failed = y > threshold
+    return np.where(failed.any(1), failed.argmax(1) + 1.0, np.nan)

@@ -1,0 +1,217 @@
+"""The networks S1-S4 as data: sizes and choices, constants, signs and bounds of the synapses."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, Literal, NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from jaxsnn._checks import require, require_finite, require_positive
+from jaxsnn.encoding import N_GROUPS, AngleCode, RateTable, rate_table
+from jaxsnn.neurons import LIFParams, check_lif
+from jaxsnn.plasticity import Bounds, Rule, STDPParams, check_stdp
+from jaxsnn.rewards import RewardParams, check_rewards, reward_params
+
+__all__ = [
+    "NETWORKS",
+    "NetworkConfig",
+    "NetworkParams",
+    "Weights",
+    "check_network",
+    "network_config",
+    "network_params",
+    "neuron_signs",
+    "weight_bounds",
+]
+
+
+@dataclasses.dataclass(frozen=True)
+class NetworkConfig:
+    """Sizes and choices of a network; a change of any of them compiles anew.
+
+    Attributes:
+        rule: "additive" (A-RM-STDP) or "multiplicative" (M-RM-STDP).
+        encoding: firing rates of the inputs, "reference" (S1, S2) or "proposed" (S3, S4).
+        hidden_exc, hidden_inh: hidden neurons of each kind, both halves together.
+        group_exc, group_inh: input neurons of each kind per group.
+        dt: step [s].
+        control_steps: steps the network runs per control step of the robot; open in the source.
+        hold_steps: steps for which weights are held before a reward changes them; divides
+            `control_steps`; 1 is the definition.
+        bounds: "hard" (the source) or "soft".
+        w_max_split: which half of the first layer's synapses of the proposed network has the lower
+            bound: those onto inhibitory hidden neurons ("post") or from inhibitory inputs ("pre");
+            the source only says "half".
+        angle_code: order of the rates of the angle's intervals, see `encoding.ANGLE_CODES`.
+        reward_timing: the reward of a control step comes from the reading that the network saw
+            ("before") or from the one after the move ("after").
+    """
+
+    rule: Rule = "multiplicative"
+    encoding: Literal["reference", "proposed"] = "proposed"
+    hidden_exc: int = 104
+    hidden_inh: int = 104
+    group_exc: int = 15
+    group_inh: int = 15
+    dt: float = 1e-3
+    control_steps: int = 400
+    hold_steps: int = 100
+    bounds: Bounds = "hard"
+    w_max_split: Literal["post", "pre"] = "post"
+    angle_code: AngleCode = "region"
+    reward_timing: Literal["before", "after"] = "before"
+
+    def __post_init__(self) -> None:
+        """Refuse sizes and choices that make no network."""
+        for name in ("hidden_exc", "hidden_inh"):
+            n = getattr(self, name)
+            require(n >= 0 and n % 2 == 0, f"{name} = {n}: expected an even number, two halves")
+        require(self.n_hidden > 0, "hidden_exc = hidden_inh = 0: the hidden layer needs neurons")
+        for name in ("group_exc", "group_inh"):
+            n = getattr(self, name)
+            require(n >= 0, f"{name} = {n}: expected a number >= 0")
+        require(self.n_in > 0, "group_exc = group_inh = 0: a group needs input neurons")
+        require_positive("dt", self.dt, "give the step in seconds, 1e-3 for one millisecond")
+        for name in ("control_steps", "hold_steps"):
+            n = getattr(self, name)
+            require(n > 0, f"{name} = {n}: expected at least one step")
+        require(
+            self.control_steps % self.hold_steps == 0,
+            f"hold_steps = {self.hold_steps} does not divide control_steps = {self.control_steps}; "
+            "choose a divisor",
+        )
+        choices: dict[str, tuple[str, ...]] = {
+            "rule": ("additive", "multiplicative"),
+            "encoding": ("reference", "proposed"),
+            "bounds": ("hard", "soft"),
+            "w_max_split": ("post", "pre"),
+            "reward_timing": ("before", "after"),
+        }
+        for name, allowed in choices.items():
+            value = getattr(self, name)
+            require(value in allowed, f"{name} = {value!r}: expected one of {allowed}")
+        rate_table(self.encoding, self.angle_code)
+
+    @property
+    def n_in(self) -> int:
+        """Input neurons."""
+        return N_GROUPS * (self.group_exc + self.group_inh)
+
+    @property
+    def n_hidden(self) -> int:
+        """Hidden neurons."""
+        return self.hidden_exc + self.hidden_inh
+
+    @property
+    def n_half(self) -> int:
+        """Hidden neurons of one motor."""
+        return self.n_hidden // 2
+
+    @property
+    def rates(self) -> RateTable:
+        """Firing rates of the intervals [Hz]."""
+        return rate_table(self.encoding, self.angle_code)
+
+
+NETWORKS: dict[str, dict[str, Any]] = {
+    "S1": {"rule": "additive", "encoding": "reference", "hidden_exc": 210, "hidden_inh": 0},
+    "S2": {"rule": "multiplicative", "encoding": "reference", "hidden_exc": 210, "hidden_inh": 0},
+    "S3": {"rule": "additive", "encoding": "proposed", "hidden_exc": 104, "hidden_inh": 104},
+    "S4": {"rule": "multiplicative", "encoding": "proposed", "hidden_exc": 104, "hidden_inh": 104},
+}
+
+
+class NetworkParams(NamedTuple):
+    """What a sweep may vary without compiling anew; leaves are scalars.
+
+    Attributes:
+        hidden, output: neurons of the two layers.
+        stdp: traces and eligibility.
+        reward: rewards.
+        gamma: learning rate [1/mV for the multiplicative rule, 1 for the additive one].
+        gamma_output: learning rate of the second layer relative to `gamma`.
+        w_max: bound of a weight [mV] (Table 2.1).
+        w_max_low: bound of the lower half of the first layer [mV] (section 2.4.4).
+        w_min: lower bound of a magnitude [mV].
+        init_low: initial weights are uniform between this fraction of their bound and the bound.
+        gain_input, gain_output: what a weight is multiplied with to give the jump of the potential.
+        steering_gain: degrees per Hz of difference between the motors; 1 is the source.
+    """
+
+    hidden: LIFParams = LIFParams()
+    output: LIFParams = LIFParams()
+    stdp: STDPParams = STDPParams()
+    reward: RewardParams = RewardParams()
+    gamma: float | Array = 1e-3
+    gamma_output: float | Array = 1.0
+    w_max: float | Array = 5.0
+    w_max_low: float | Array = 2.5
+    w_min: float | Array = 0.0
+    init_low: float | Array = 0.0
+    gain_input: float | Array = 1.0
+    gain_output: float | Array = 1.0
+    steering_gain: float | Array = 1.0
+
+
+class Weights(NamedTuple):
+    """Magnitudes [mV]: input to hidden `[n_in, n_hidden]`, hidden to motor `[2, n_half]`."""
+
+    hidden: Float[Array, "n_in n_hidden"]
+    output: Float[Array, "2 n_half"]
+
+
+def network_config(name: str, **changes: Any) -> NetworkConfig:
+    """The configuration of "S1", "S2", "S3" or "S4" (Table 2.2), with changes.
+
+    Example:
+        >>> network_config("S2").n_hidden, network_config("S4").n_hidden
+        (210, 208)
+    """
+    if name not in NETWORKS:
+        raise ValueError(f"network = {name!r}: expected one of {sorted(NETWORKS)}")
+    return NetworkConfig(**{**NETWORKS[name], **changes})
+
+
+def network_params(config: NetworkConfig, **changes: Any) -> NetworkParams:
+    """The source's constants for a configuration, with changes of any field."""
+    return NetworkParams(reward=reward_params(config.rule))._replace(**changes)
+
+
+def check_network(config: NetworkConfig, params: NetworkParams) -> None:
+    """Refuse constants with which a network cannot run; call it before compiling.
+
+    Raises:
+        ValueError: names the constant, its value and the fix.
+    """
+    check_lif(params.hidden, dt=config.dt)
+    check_lif(params.output, dt=config.dt)
+    check_stdp(params.stdp, dt=config.dt)
+    check_rewards(params.reward)
+    for name in ("w_max", "w_max_low", "gain_input", "gain_output"):
+        require_positive(name, getattr(params, name), "give it in millivolts (gains: a number)")
+    for name in ("gamma", "gamma_output", "w_min", "init_low"):
+        require_positive(name, getattr(params, name), "give a number >= 0", zero=True)
+    require_finite("steering_gain", params.steering_gain, "give degrees per Hz")
+
+
+def neuron_signs(config: NetworkConfig) -> tuple[np.ndarray, np.ndarray]:
+    """+1 for excitatory, -1 for inhibitory: input neurons `[n_in]`, hidden neurons `[n_hidden]`."""
+    group = np.repeat([1.0, -1.0], [config.group_exc, config.group_inh])
+    half = np.repeat([1.0, -1.0], [config.hidden_exc // 2, config.hidden_inh // 2])
+    return np.tile(group, N_GROUPS).astype(np.float32), np.tile(half, 2).astype(np.float32)
+
+
+def weight_bounds(config: NetworkConfig, params: NetworkParams) -> Weights:
+    """Upper bounds [mV]: `[n_in or 1, n_hidden or 1]` and `[1, 1]`, to broadcast with `Weights`."""
+    pre, hidden = neuron_signs(config)
+    high, low = jnp.asarray(params.w_max, jnp.float32), jnp.asarray(params.w_max_low, jnp.float32)
+    if config.encoding == "reference":
+        first = high[None, None]
+    elif config.w_max_split == "post":
+        first = jnp.where(hidden[None, :] > 0, high[None, None], low[None, None])
+    else:
+        first = jnp.where(pre[:, None] > 0, high[None, None], low[None, None])
+    return Weights(hidden=first, output=high[None, None])

@@ -1,0 +1,283 @@
+"""The dynamics of the networks S1-S4: input groups, a hidden layer in two halves, two motors.
+
+Weights are magnitudes; the sign of a synapse is that of its presynaptic neuron (Dale's law), a
+fixed vector. Hidden neurons come in two halves, the left motor's first; in each half the excitatory
+ones come first. Two forms of the same dynamics: `step` (1 ms, weights change in every step: the
+definition) and `window` with `reinforce` (weights held for a window, matrix products).
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxsnn._checks import require
+from jaxsnn.architecture import (
+    NetworkConfig,
+    NetworkParams,
+    Weights,
+    check_network,
+    network_config,
+    network_params,
+    neuron_signs,
+    weight_bounds,
+)
+from jaxsnn.neurons import LIFParams, LIFState, lif_init, lif_step
+from jaxsnn.plasticity import STDPState, apply_reward, check_bounds, stdp_init, stdp_step
+from jaxsnn.rewards import synapse_signs
+from jaxsnn.window import STDPKernel, stdp_kernel, stdp_window
+
+__all__ = [
+    "Eligibility",
+    "NetworkConfig",
+    "NetworkParams",
+    "NetworkState",
+    "Spikes",
+    "Weights",
+    "fire",
+    "init",
+    "kernel",
+    "network_config",
+    "network_params",
+    "reinforce",
+    "settle",
+    "step",
+    "window",
+]
+
+
+class NetworkState(NamedTuple):
+    """Weights, membranes of both layers, traces and eligibility of both sets of synapses."""
+
+    weights: Weights
+    hidden: LIFState
+    output: LIFState
+    stdp_hidden: STDPState
+    stdp_output: STDPState
+
+
+class Eligibility(NamedTuple):
+    """Time integral of `z` over a window [mV], same shapes as `Weights`."""
+
+    hidden: Float[Array, "n_in n_hidden"]
+    output: Float[Array, "2 n_half"]
+
+
+class Spikes(NamedTuple):
+    """Spikes of the hidden and of the motor neurons, 0. or 1., with or without a leading time."""
+
+    hidden: Float[Array, "*t n_hidden"]
+    output: Float[Array, "*t 2"]
+
+
+def init(
+    key: Key[Array, ""],
+    config: NetworkConfig,
+    params: NetworkParams,
+    weights: Weights | None = None,
+) -> NetworkState:
+    """A network at rest with random weights, uniform between 0 (`init_low`) and their bounds.
+
+    Args:
+        key: typed PRNG key.
+        config: NetworkConfig.
+        params: NetworkParams.
+        weights: take these instead of random ones; they must lie inside the bounds.
+
+    Raises:
+        ValueError: a constant or a given weight is not acceptable.
+    """
+    check_network(config, params)
+    top = weight_bounds(config, params)
+    shapes = (config.n_in, config.n_hidden), (2, config.n_half)
+    if weights is None:
+        keys = jax.random.split(key)
+        drawn = []
+        for k, shape, bound in zip(keys, shapes, top, strict=True):
+            u = jax.random.uniform(k, shape)
+            drawn.append((params.init_low + (1.0 - params.init_low) * u) * bound)
+        weights = Weights(*drawn)
+    for field, shape in zip(Weights._fields, shapes, strict=True):
+        given = getattr(weights, field)
+        require(
+            given.shape == shape,
+            f"weights.{field} has shape {given.shape}, this network needs {shape}",
+        )
+        check_bounds(given, params.w_min, getattr(top, field), f"weights.{field}")
+    return NetworkState(
+        weights=weights,
+        hidden=lif_init(params.hidden, config.n_hidden),
+        output=lif_init(params.output, 2),
+        stdp_hidden=stdp_init(config.n_in, config.n_hidden),
+        stdp_output=jax.tree.map(
+            lambda x: jnp.broadcast_to(x, (2, *x.shape)), stdp_init(config.n_half, 1)
+        ),
+    )
+
+
+def settle(params: NetworkParams, state: NetworkState, fresh: Bool[Array, ""]) -> NetworkState:
+    """Membranes at rest where `fresh` (a trial begins); traces are dropped by `window(keep=0)`."""
+
+    def rest(lif: LIFParams, layer: LIFState) -> LIFState:
+        return LIFState(
+            v=jnp.where(fresh, lif.v_rest, layer.v),
+            refractory=jnp.where(fresh, 0.0, layer.refractory),
+        )
+
+    return state._replace(
+        hidden=rest(params.hidden, state.hidden), output=rest(params.output, state.output)
+    )
+
+
+def _fire(
+    config: NetworkConfig,
+    params: NetworkParams,
+    state: NetworkState,
+    jump: Float[Array, " n_hidden"],
+    signed_output: Float[Array, "2 n_half"],
+) -> tuple[LIFState, LIFState, Spikes]:
+    """One step of both layers of neurons, given what the inputs add to the hidden layer."""
+    hidden, fired = lif_step(params.hidden, state.hidden, 0.0, jump, dt=config.dt)
+    spikes = fired.astype(jnp.float32)
+    to_motor = jnp.sum(signed_output * spikes.reshape(2, config.n_half), axis=1)
+    output, motor = lif_step(params.output, state.output, 0.0, to_motor, dt=config.dt)
+    return hidden, output, Spikes(hidden=spikes, output=motor.astype(jnp.float32))
+
+
+def step(
+    config: NetworkConfig,
+    params: NetworkParams,
+    state: NetworkState,
+    pre: Float[Array, " n_in"],
+    reward: Float[Array, "2"],
+) -> tuple[NetworkState, Spikes]:
+    r"""One step of `dt`: neurons, traces, eligibility, and the weights under a reward.
+
+    .. math:: \dot w = \gamma\, s\, r_{motor}\, z \quad (\text{times } w \text{ if multiplicative})
+
+    with `s` the synapse's sign product (`rewards.synapse_signs`).
+
+    Args:
+        config: NetworkConfig.
+        params: NetworkParams.
+        state: NetworkState.
+        pre: input spikes of this step, 0. or 1., `[n_in]`.
+        reward: for the synapses of the left and of the right motor, `[2]`.
+
+    Returns:
+        The new state and the spikes of this step.
+    """
+    sign_pre, _ = neuron_signs(config)
+    weights = state.weights
+    jump = params.gain_input * ((pre * sign_pre) @ weights.hidden)
+    hidden, output, spikes = _fire(
+        config, params, state, jump, _signed_output(config, params, weights)
+    )
+    stdp_hidden = stdp_step(params.stdp, state.stdp_hidden, pre, spikes.hidden, dt=config.dt)
+    stdp_output = jax.vmap(lambda s, x, y: stdp_step(params.stdp, s, x, y, dt=config.dt))(
+        state.stdp_output, spikes.hidden.reshape(2, -1), spikes.output[:, None]
+    )
+    held = Eligibility(stdp_hidden.z * config.dt, stdp_output.z[..., 0] * config.dt)
+    weights = reinforce(config, params, weights, held, reward)
+    return NetworkState(weights, hidden, output, stdp_hidden, stdp_output), spikes
+
+
+def _signed_output(config: NetworkConfig, params: NetworkParams, weights: Weights) -> Array:
+    _, sign_hidden = neuron_signs(config)
+    return params.gain_output * weights.output * sign_hidden.reshape(2, config.n_half)
+
+
+def kernel(config: NetworkConfig, params: NetworkParams) -> STDPKernel:
+    """The pair kernel for windows of `config.hold_steps`."""
+    return stdp_kernel(params.stdp, config.hold_steps, dt=config.dt)
+
+
+def fire(
+    config: NetworkConfig, params: NetworkParams, state: NetworkState, pre: Float[Array, "t n_in"]
+) -> tuple[NetworkState, Spikes]:
+    """Run the neurons over the rows of `pre` with the weights held and no plasticity."""
+    sign_pre, _ = neuron_signs(config)
+    jumps = params.gain_input * ((pre * sign_pre[None, :]) @ state.weights.hidden)
+    signed_output = _signed_output(config, params, state.weights)
+
+    def body(carry: NetworkState, jump: Array) -> tuple[NetworkState, Spikes]:
+        hidden, output, spikes = _fire(config, params, carry, jump, signed_output)
+        return carry._replace(hidden=hidden, output=output), spikes
+
+    # Only the membranes go round the loop: synapses in the carry would be copied.
+    small = state._replace(weights=None, stdp_hidden=None, stdp_output=None)  # type: ignore[arg-type]
+    small, spikes = jax.lax.scan(body, small, jumps)
+    return state._replace(hidden=small.hidden, output=small.output), spikes
+
+
+def window(
+    config: NetworkConfig,
+    params: NetworkParams,
+    stdp: STDPKernel,
+    state: NetworkState,
+    pre: Float[Array, "t n_in"],
+    keep: float | Float[Array, ""] = 1.0,
+) -> tuple[NetworkState, Eligibility, Spikes]:
+    """All steps of a window with the weights held: currents and traces as matrix products.
+
+    Args:
+        config: NetworkConfig.
+        params: NetworkParams.
+        stdp: `kernel(config, params)`, for as many steps as `pre` has rows.
+        state: NetworkState.
+        pre: input spikes, 0. or 1., `[T, n_in]`.
+        keep: 0. to forget traces and eligibility from before the window, else 1.
+
+    Returns:
+        The state with the weights as they were, the eligibility of the window for `reinforce`, and
+        all spikes.
+    """
+    state, spikes = fire(config, params, state, pre)
+    halves = spikes.hidden.reshape(-1, 2, config.n_half)
+    stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, pre, spikes.hidden, keep)
+    stdp_output, second = jax.vmap(stdp_window, in_axes=(None, 0, 1, 1, None))(
+        stdp, state.stdp_output, halves, spikes.output[:, :, None], keep
+    )
+    state = state._replace(stdp_hidden=stdp_hidden, stdp_output=stdp_output)
+    return state, Eligibility(first, second[..., 0]), spikes
+
+
+def reinforce(
+    config: NetworkConfig,
+    params: NetworkParams,
+    weights: Weights,
+    eligibility: Eligibility,
+    reward: Float[Array, "2"],
+) -> Weights:
+    """Change the weights by a reward held over the window that the eligibility is from.
+
+    Args:
+        config: NetworkConfig.
+        params: NetworkParams.
+        weights: Weights.
+        eligibility: time integral of `z`, from `window`.
+        reward: for the synapses of the left and of the right motor, `[2]`.
+
+    Returns:
+        The new weights, inside their bounds.
+
+    Source:
+        Shim (2020), Eq. 2.3 or 2.8 with the sign adjustment of section 2.3.2.
+    """
+    sign_pre, sign_hidden = (jnp.asarray(s) for s in neuron_signs(config))
+    to_first, to_second = synapse_signs(sign_pre, sign_hidden)
+    by_neuron = params.gamma * jnp.repeat(reward, config.n_half)
+    drives = Weights(
+        hidden=to_first * by_neuron[None, :] * eligibility.hidden,
+        output=(params.gamma_output * to_second * by_neuron).reshape(2, -1) * eligibility.output,
+    )
+    bounds = weight_bounds(config, params)
+    return Weights(
+        *(
+            apply_reward(w, d, params.w_min, top, rule=config.rule, bounds=config.bounds)
+            for w, d, top in zip(weights, drives, bounds, strict=True)
+        )
+    )

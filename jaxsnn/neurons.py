@@ -1,0 +1,140 @@
+"""Leaky integrate-and-fire neurons: one Euler step, and a scan over many.
+
+Times are in seconds, potentials and synaptic weights in millivolts (as Table 2.1 of the source
+gives them), so that a weight is the jump of the membrane potential that one spike causes.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+from jaxsnn._checks import concrete, require, require_finite, require_positive
+
+__all__ = ["LIFParams", "LIFState", "check_lif", "lif_init", "lif_scan", "lif_step"]
+
+
+class LIFParams(NamedTuple):
+    """Constants of a layer of neurons; leaves are scalars or broadcast against the layer.
+
+    Attributes:
+        tau_m: membrane time constant [s].
+        v_rest: resting potential [mV].
+        v_reset: potential after a spike [mV].
+        v_th: a neuron whose potential exceeds this fires [mV].
+        resistance: `R`, membrane resistance [MOhm], so that `R I` is in mV for `I` in nA.
+        t_ref: refractory time [s]; the membrane neither leaks nor integrates meanwhile.
+    """
+
+    tau_m: float | Array = 20e-3
+    v_rest: float | Array = 0.0
+    v_reset: float | Array = 0.0
+    v_th: float | Array = 15.0
+    resistance: float | Array = 1.0
+    t_ref: float | Array = 2e-3
+
+
+class LIFState(NamedTuple):
+    """Membrane potential `v` [mV] and what is left of the refractory time `refractory` [s]."""
+
+    v: Float[Array, "*batch n"]
+    refractory: Float[Array, "*batch n"]
+
+
+def check_lif(params: LIFParams, *, dt: float) -> None:
+    """Refuse constants with which the Euler step cannot work.
+
+    Raises:
+        ValueError: a time constant is not positive, the step is unstable (`dt >= 2 tau_m`), the
+            reset is not below the threshold, or a value is not finite.
+    """
+    require_positive("dt", dt, "give the step in seconds, 1e-3 for one millisecond")
+    require_positive("tau_m", params.tau_m, "give it in seconds, 20e-3 for twenty milliseconds")
+    require_positive("t_ref", params.t_ref, "give it in seconds, 0 for none", zero=True)
+    for name in ("v_rest", "v_reset", "v_th", "resistance"):
+        require_finite(name, getattr(params, name), "give it in millivolts (resistance: megohms)")
+    tau = concrete(params.tau_m)
+    if tau is not None:
+        require(
+            bool(dt < 2 * tau.min()),
+            f"dt = {dt} s is not below 2 tau_m = {2 * tau.min()} s: the Euler step would oscillate "
+            "and grow; take a smaller dt or a longer tau_m",
+        )
+    reset, threshold = concrete(params.v_reset), concrete(params.v_th)
+    if reset is not None and threshold is not None:
+        require(
+            bool((reset < threshold).all()),
+            f"v_reset = {params.v_reset} is not below v_th = {params.v_th}: a neuron would fire "
+            "for ever; lower v_reset",
+        )
+
+
+def lif_init(params: LIFParams, n: int) -> LIFState:
+    """`n` neurons at rest, none of them refractory."""
+    require(n > 0, f"n = {n}: a layer needs at least one neuron")
+    v = jnp.full((n,), 1.0, jnp.float32) * jnp.asarray(params.v_rest, jnp.float32)
+    return LIFState(v=v, refractory=jnp.zeros((n,), jnp.float32))
+
+
+def lif_step(
+    params: LIFParams,
+    state: LIFState,
+    current: Float[Array, "*#batch n"] | Float[Array, ""] | float,
+    jump: Float[Array, "*#batch n"],
+    *,
+    dt: float,
+) -> tuple[LIFState, Bool[Array, "*batch n"]]:
+    r"""One Euler step of the leaky integrate-and-fire neuron.
+
+    .. math:: \tau_m \frac{dv}{dt} = -(v - v_{rest}) + R I(t)
+
+    Order within a step: leak and current, threshold, synaptic jumps, reset. A jump is the impulse
+    part of `R I` (`R I = tau_m w delta(t)` raises `v` by `w`); it counts for the threshold from the
+    next step on, so a spike reaches the next layer one step later, and it is lost on a neuron that
+    is refractory or has just fired.
+
+    Args:
+        params: LIFParams.
+        state: LIFState, `[n]`.
+        current: `I` [nA], held over the step; `[n]` or a scalar.
+        jump: sum of the weights of the spikes that arrive in this step [mV], `[n]`.
+        dt: step [s].
+
+    Returns:
+        The new state and the spikes of this step, `[n]` bool.
+
+    Source:
+        Shim (2020), Eq. 2.1; order of operations as in Brian 2 with `(unless refractory)`.
+
+    Example:
+        >>> params = LIFParams(v_th=1.0)
+        >>> jump = jnp.array([0.5, 2.0])
+        >>> state, _ = lif_step(params, lif_init(params, 2), 0.0, jump, dt=1e-3)
+        >>> lif_step(params, state, 0.0, jnp.zeros(2), dt=1e-3)[1].tolist()
+        [False, True]
+    """
+    left = jnp.maximum(state.refractory - dt, 0.0)
+    # Half a step of slack: t_ref / dt is an integer only up to rounding.
+    active = left <= 0.5 * dt
+    v = state.v + (dt / params.tau_m) * (params.v_rest - state.v + params.resistance * current)
+    v = jnp.where(active, v, state.v)
+    spikes = active & (v > params.v_th)
+    v = jnp.where(active, v + jump, v)
+    v = jnp.where(spikes, params.v_reset, v)
+    return LIFState(v=v, refractory=jnp.where(spikes, params.t_ref, left)), spikes
+
+
+def lif_scan(
+    params: LIFParams, state: LIFState, jumps: Float[Array, "t n"], *, dt: float
+) -> tuple[LIFState, Bool[Array, "t n"], Float[Array, "t n"]]:
+    """`lif_step` over the rows of `jumps` [mV]; returns the last state, spikes and potentials."""
+
+    def body(carry: LIFState, jump: Array) -> tuple[LIFState, tuple[Array, Array]]:
+        carry, spikes = lif_step(params, carry, 0.0, jump, dt=dt)
+        return carry, (spikes, carry.v)
+
+    state, (spikes, v) = jax.lax.scan(body, state, jumps)
+    return state, spikes, v

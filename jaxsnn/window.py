@@ -1,0 +1,155 @@
+r"""A window of many STDP steps at once, as matrix products.
+
+While the weights are held, nothing in the eligibility trace depends on them, and everything in it
+is linear in pairs of spikes: pre at step `s` and post at step `t` add a number that depends on `s`
+and `t` alone. With spikes as matrices `S` (`T` x pre) and `O` (`T` x post) and that number as a
+fixed `T` x `T` matrix `K`,
+
+.. math:: z(T) = \lambda^T z_0 + (K S)^\top O, \qquad
+          \int z \, dt = s z_0 + (K' S)^\top O
+
+which costs two matrix products per window instead of `T` passes over all synapses. What the traces
+remember from before the window enters as one more row of `S` and `O`, row and column `T` of `K`.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from jaxsnn._checks import require
+from jaxsnn.plasticity import STDPParams, STDPState, Traces, stdp_step
+
+__all__ = ["STDPKernel", "stdp_kernel", "stdp_steps", "stdp_window"]
+
+
+class STDPKernel(NamedTuple):
+    """What `stdp_window` needs to know about `STDPParams` and the number of steps.
+
+    Attributes:
+        pairs: `K` and `K'`, with the row and column of the old traces, `[2, T + 1, T + 1]`,
+            indexed `[which, post step, pre step]`.
+        carry: factors of `z_0` in `z(T)` [1] and in its integral [s], `[2]`.
+        plus, minus: weight of each step's spikes in the traces at the end, `[T]`.
+        carry_plus, carry_minus: factor of the old traces in the new ones.
+    """
+
+    pairs: Float[Array, "2 t1 t1"]
+    carry: Float[Array, "2"]
+    plus: Float[Array, " t"]
+    minus: Float[Array, " t"]
+    carry_plus: Float[Array, ""]
+    carry_minus: Float[Array, ""]
+
+
+def stdp_kernel(params: STDPParams, n_steps: int, *, dt: float) -> STDPKernel:
+    r"""Fold traces, pairing and the decay of `z` over `n_steps` steps into one matrix.
+
+    A pair whose later spike is at step `u` has decayed by :math:`\lambda^{T-1-u}` at the end and
+    has summed to :math:`dt (1-\lambda^{T-u})/(1-\lambda)`, with :math:`\lambda = e^{-dt/\tau_z}`.
+
+    Args:
+        params: STDPParams, scalar leaves (may be traced).
+        n_steps: `T`, steps per window.
+        dt: step [s].
+
+    Returns:
+        STDPKernel; compute it once, outside the scan over windows.
+    """
+    require(n_steps > 0, f"n_steps = {n_steps}: a window needs at least one step")
+    t = jnp.arange(n_steps)
+    lag = t[:, None] - t[None, :]  # post step minus pre step
+    left = (n_steps - 1 - t).astype(jnp.float32)
+    rate_z, rate_plus, rate_minus = (
+        dt / tau for tau in (params.tau_z, params.tau_plus, params.tau_minus)
+    )
+    # expm1 keeps the sums exact where tau_z is long against the step.
+    at_end = jnp.exp(-rate_z * left) / params.tau_z
+    summed = jnp.expm1(-rate_z * (left + 1.0)) / jnp.expm1(-rate_z) * dt / params.tau_z
+    weight = jnp.stack([at_end, summed])
+    a_minus = params.a_minus * params.anti_causal
+    distance = jnp.abs(lag).astype(jnp.float32)
+    causal = jnp.where(lag >= 0, params.a_plus * jnp.exp(-rate_plus * distance), 0.0)
+    anti = jnp.where(lag <= 0, a_minus * jnp.exp(-rate_minus * distance), 0.0)
+    inner = weight[:, :, None] * causal[None] + weight[:, None, :] * anti[None]
+    since = (t + 1).astype(jnp.float32)  # steps since the traces at the window's start
+    old_plus = weight * jnp.exp(-rate_plus * since)[None]
+    old_minus = weight * jnp.exp(-rate_minus * since)[None]
+    top = jnp.concatenate([inner, old_plus[:, :, None]], axis=2)
+    corner = jnp.zeros((2, 1, 1), top.dtype)
+    bottom = jnp.concatenate([old_minus[:, None, :], corner], axis=2)
+    n = float(n_steps)
+    carry_sum = jnp.expm1(-rate_z * n) / jnp.expm1(-rate_z) * jnp.exp(-rate_z) * dt
+    return STDPKernel(
+        pairs=jnp.concatenate([top, bottom], axis=1),
+        carry=jnp.stack([jnp.exp(jnp.asarray(-rate_z * n)), carry_sum]),
+        plus=params.a_plus * jnp.exp(-rate_plus * left),
+        minus=a_minus * jnp.exp(-rate_minus * left),
+        carry_plus=jnp.exp(jnp.asarray(-rate_plus * n)),
+        carry_minus=jnp.exp(jnp.asarray(-rate_minus * n)),
+    )
+
+
+def stdp_window(
+    kernel: STDPKernel,
+    state: STDPState,
+    pre: Float[Array, "t n_pre"],
+    post: Float[Array, "t n_post"],
+    keep: float | Float[Array, ""] = 1.0,
+) -> tuple[STDPState, Float[Array, "n_pre n_post"]]:
+    r"""`T` calls of `plasticity.stdp_step` at once, and the time integral of `z` over them.
+
+    Args:
+        kernel: from `stdp_kernel` for the same number of steps.
+        state: STDPState at the window's start.
+        pre: presynaptic spikes, 0. or 1., `[T, n_pre]`.
+        post: postsynaptic spikes, 0. or 1., `[T, n_post]`.
+        keep: 1 to go on from `state`, 0 to start from empty traces; a number rather than a reset
+            of the state, because it costs no pass over the synapses.
+
+    Returns:
+        The state after the window and :math:`\int z\,dt` [mV], the sum over the `T` values of `z`
+        after each step, times dt.
+
+    Source:
+        Shim (2020), Eq. 2.4-2.7, summed over a window in closed form.
+    """
+    p_plus, p_minus = keep * state.traces.p_plus, keep * state.traces.p_minus
+    pre_rows = jnp.concatenate([pre, p_plus[None]])
+    post_rows = jnp.concatenate([post, p_minus[None]])
+    # The small matrix is applied to the smaller layer; the rest is one product over time.
+    if pre.shape[-1] <= post.shape[-1]:
+        folded = jnp.einsum("kts,sj->ktj", kernel.pairs, pre_rows)
+        change = jnp.einsum("ktj,ti->kji", folded, post_rows)
+    else:
+        folded = jnp.einsum("kts,ti->ksi", kernel.pairs, post_rows)
+        change = jnp.einsum("sj,ksi->kji", pre_rows, folded)
+    carry = keep * kernel.carry
+    traces = Traces(
+        p_plus=kernel.carry_plus * p_plus + kernel.plus @ pre,
+        p_minus=kernel.carry_minus * p_minus + kernel.minus @ post,
+    )
+    z = carry[0] * state.z + change[0]
+    return STDPState(traces=traces, z=z), carry[1] * state.z + change[1]
+
+
+def stdp_steps(
+    params: STDPParams,
+    state: STDPState,
+    pre: Float[Array, "t n_pre"],
+    post: Float[Array, "t n_post"],
+    *,
+    dt: float,
+) -> tuple[STDPState, Float[Array, "n_pre n_post"]]:
+    """What `stdp_window` computes, step by step: the definition it is tested against."""
+
+    def body(carry: tuple[STDPState, Array], spikes: tuple[Array, Array]) -> tuple:
+        held, total = carry
+        held = stdp_step(params, held, *spikes, dt=dt)
+        return (held, total + held.z * dt), None
+
+    (state, total), _ = jax.lax.scan(body, (state, jnp.zeros_like(state.z)), (pre, post))
+    return state, total

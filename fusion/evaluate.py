@@ -146,7 +146,7 @@ def gate_auroc(
     weights: Float[ArrayLike, "n k"],
     mask: Bool[ArrayLike, "n k"],
     *,
-    among: GateAmong = "pooled",
+    among: str = "pooled",
 ) -> float:
     """How well fusion weights tell clean channels from failed ones: 1 always, 0.5 not at all.
 

@@ -256,7 +256,7 @@ def _clip(key: PRNGKeyArray, x: Array) -> Array:
     return jnp.clip(x, -rail, rail)
 
 
-_FAILED: dict[FailureKind, Callable[[PRNGKeyArray, Array], Array]] = {
+_FAILED: dict[str, Callable[[PRNGKeyArray, Array], Array]] = {
     "uniform": _uniform_noise,
     "gaussian": _gaussian_noise,
     "zero": _zero,
@@ -272,7 +272,7 @@ def apply_failure(
     key: PRNGKeyArray,
     x: Float[Array, "n k t"],
     mask: Bool[Array, "n k"],
-    kind: FailureKind,
+    kind: str,
     *,
     severity: float | Float[Array, ""] = 1.0,
 ) -> Float[Array, "n k t"]:
@@ -321,7 +321,7 @@ def corrupt(
     key: PRNGKeyArray,
     x: Float[Array, "n k t"],
     protocol: Protocol,
-    kind: FailureKind,
+    kind: str,
     *,
     severity: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, "n k t"], Bool[Array, "n k"]]:

@@ -108,7 +108,7 @@ def plot_gate(
     names = [_short(name) for name in channels]
     axes.set_xticks(range(k), names, rotation=40, ha="right", rotation_mode="anchor", fontsize=8)
     axes.set_xlim(-0.6, k - 0.4)
-    axes.set_ylim(bottom=0.0)
+    axes.set_ylim(0.0, 1.12 * axes.get_ylim()[1])
     axes.set_ylabel("fusion weight")
     axes.set_title(title, fontsize=10)
     axes.legend(frameon=False, ncols=3, fontsize=8, loc="upper right")
@@ -224,4 +224,4 @@ def _weights_and_mask(weights: ArrayLike, mask: ArrayLike, k: int) -> tuple[np.n
 def _short(name: str) -> str:
     """A channel name that fits under an axis."""
     text = name.replace("_", " ")
-    return text if len(text) <= 24 else text[:23] + "…"
+    return text if len(text) <= 36 else text[:35] + "…"

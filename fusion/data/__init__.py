@@ -108,5 +108,5 @@ def load(
     if name == "har":
         return load_har(data_dir, download=download)
     if name == "driver":
-        return load_driver(data_dir, split="trip" if split == "trip" else "random", seed=seed)
+        return load_driver(data_dir, split=split, seed=seed)
     return load_simulated(seed=seed)

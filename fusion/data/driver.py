@@ -39,8 +39,9 @@ DRIVER_FILES = (
 N_ROWS = 94_380
 N_TRIPS = 44
 N_TRAIN = 75_501  # of the source's random split; 18,879 rows are left for the test
-# The header of the file repeats the coolant's name for the transmission oil temperature.
-OIL = "Engine_coolant_temperature.1"
+# The header of the published file repeats the coolant's name for the transmission oil temperature.
+OIL = "Transmission_oil_temperature"
+OIL_IN_FILE = "Engine_coolant_temperature.1"
 # The 15 signals of Kwak et al. (2016), which the dissertation uses as well.
 DRIVER_SOURCE_CHANNELS = (
     "Long_Term_Fuel_Trim_Bank1",
@@ -81,12 +82,11 @@ def _lines(path: Path) -> Iterable[list[str]]:
 
 
 def _header(path: Path, names: list[str]) -> list[str]:
-    """Column names, with the second `Engine_coolant_temperature` told from the first."""
-    seen: dict[str, int] = {}
-    header = []
+    """Column names, with the second `Engine_coolant_temperature` named as what it is."""
+    header: list[str] = []
     for name in (n.strip() for n in names):
-        header.append(name if name not in seen else f"{name}.{seen[name]}")
-        seen[name] = seen.get(name, 0) + 1
+        repeated = name == "Engine_coolant_temperature" and name in header
+        header.append(OIL if repeated or name == OIL_IN_FILE else name)
     needed = {"Time(s)", "Class", *DRIVER_CHANNELS, *DRIVER_SOURCE_CHANNELS}
     missing = sorted(needed - set(header))
     if missing:
@@ -185,8 +185,8 @@ def _fill(values: np.ndarray, trip: np.ndarray) -> np.ndarray:
 def load_driver(
     data_dir: str | Path | None = None,
     *,
-    split: DriverSplit = "random",
-    features: DriverFeatures = "complete",
+    split: str = "random",
+    features: str = "complete",
     seed: int = 0,
 ) -> Dataset:
     """Load the driving data as rows of 15 scalars, scaled to [-1, 1] by training statistics.
@@ -234,8 +234,8 @@ def _to_dataset(
     labels: np.ndarray,
     *,
     path: Path,
-    split: DriverSplit,
-    features: DriverFeatures,
+    split: str,
+    features: str,
     seed: int,
 ) -> Dataset:
     trip = _trips(path, columns["Time(s)"], labels)

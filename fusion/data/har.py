@@ -6,8 +6,10 @@ recognition using smartphones, ESANN. UCI Machine Learning Repository, data set 
 
 from __future__ import annotations
 
+import contextlib
 import io
 import zipfile
+import zlib
 from collections.abc import Callable
 from pathlib import Path
 
@@ -86,7 +88,7 @@ def _explain(name: str, data: bytes, columns: int, rows: int) -> None:
     )
 
 
-def _read_text(read: Read, counts: Counts) -> Raw:
+def _read_text(read: Read, where: Path, counts: Counts) -> Raw:
     """The official layout: one text file per channel and part, one window a line."""
     raw: Raw = {}
     for part in ("train", "test"):
@@ -94,11 +96,12 @@ def _read_text(read: Read, counts: Counts) -> Raw:
         signals = []
         for channel in HAR_CHANNELS:
             name = f"{part}/Inertial Signals/{channel}_{part}.txt"
-            signals.append(_parse(name, read(name), N_TIME, rows, np.float32))
+            signals.append(_parse(f"{where}/{name}", read(name), N_TIME, rows, np.float32))
         raw[f"X_{part}"] = np.stack(signals, axis=1)
         for key in ("y", "subject"):
             name = f"{part}/{key}_{part}.txt"
-            raw[f"{key}_{part}"] = _parse(name, read(name), 1, rows, np.int64)[:, 0]
+            table = _parse(f"{where}/{name}", read(name), 1, rows, np.int64)
+            raw[f"{key}_{part}"] = table[:, 0]
     return raw
 
 
@@ -109,20 +112,27 @@ def _read_folder(folder: Path, counts: Counts) -> Raw:
             raise ValueError(f"{path}: no such file, expected the layout of {FOLDER!r} ({name})")
         return path.read_bytes()
 
-    return _read_text(read, counts)
+    return _read_text(read, folder, counts)
 
 
 def _read_zip(path: Path, counts: Counts) -> Raw:
     """The archive of the publisher: a zip of text files, today wrapped in a second zip."""
     try:
-        archive = zipfile.ZipFile(path)
-        inner = [n for n in archive.namelist() if n.endswith(INNER_ARCHIVE)]
-        if inner:
-            archive = zipfile.ZipFile(io.BytesIO(archive.read(inner[0])))
-    except zipfile.BadZipFile as error:
+        with contextlib.ExitStack() as stack:
+            archive = stack.enter_context(zipfile.ZipFile(path))
+            inner = [n for n in archive.namelist() if n.endswith(INNER_ARCHIVE)]
+            if inner:
+                data = io.BytesIO(archive.read(inner[0]))
+                archive = stack.enter_context(zipfile.ZipFile(data))
+            return _read_archive(archive, path, counts)
+    except (zipfile.BadZipFile, zlib.error, EOFError) as error:
         raise ValueError(
             f"{path}: not a whole zip file ({error}); expected {INNER_ARCHIVE!r}: fetch it again"
         ) from error
+
+
+def _read_archive(archive: zipfile.ZipFile, path: Path, counts: Counts) -> Raw:
+    """The text files below whatever folder of the archive holds `train/` and `test/`."""
     suffix = "train/y_train.txt"
     roots = [n.removesuffix(suffix) for n in archive.namelist() if n.endswith("/" + suffix)]
     root = next((r for r in roots if not r.startswith("__MACOSX")), None)
@@ -134,17 +144,17 @@ def _read_zip(path: Path, counts: Counts) -> Raw:
             return archive.read(root + name)
         except KeyError as error:
             raise ValueError(f"{path}: no {root + name} inside") from error
-        except zipfile.BadZipFile as error:
-            raise ValueError(f"{path}: {root + name} is damaged ({error})") from error
 
-    return _read_text(read, counts)
+    return _read_text(read, path, counts)
 
 
 def _read_npz(path: Path) -> Raw:
     """The compact copy: the same arrays in one compressed numpy file."""
     keys = [f"{key}_{part}" for part in ("train", "test") for key in ("X", "y", "subject")]
+    if not zipfile.is_zipfile(path):
+        raise ValueError(f"{path}: not a whole npz file (no archive inside); copy it again")
     try:
-        with np.load(path, allow_pickle=False) as file:
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
             missing = sorted(set(keys) - set(file.files))
             if missing:
                 raise ValueError(f"{path}: arrays {missing} are missing, expected {keys}")
@@ -154,7 +164,7 @@ def _read_npz(path: Path) -> Raw:
                     f"expected {list(HAR_CHANNELS)}"
                 )
             return {key: file[key] for key in keys}
-    except (zipfile.BadZipFile, EOFError, OSError) as error:
+    except (zipfile.BadZipFile, zlib.error, EOFError, OSError) as error:
         raise ValueError(f"{path}: not a whole npz file ({error}); copy it again") from error
 
 

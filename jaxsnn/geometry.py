@@ -27,6 +27,8 @@ __all__ = [
     "segment_distance",
 ]
 
+Polygon = Sequence[Sequence[int | float]] | np.ndarray
+
 
 def _cross(a: Float[Array, "... 2"], b: Float[Array, "... 2"]) -> Float[Array, "..."]:
     return a[..., 0] * b[..., 1] - a[..., 1] * b[..., 0]
@@ -173,7 +175,7 @@ def disc_box_contact(
 # --- host side: numpy, used when a map is made -------------------------------------------------
 
 
-def polygon_segments(polygon: Sequence[Sequence[float]] | np.ndarray) -> np.ndarray:
+def polygon_segments(polygon: Polygon) -> np.ndarray:
     """The sides ``(ax, ay, bx, by)`` of a closed polygon, one row for each corner."""
     points = np.asarray(polygon, dtype=np.float64)
     return np.concatenate([points, np.roll(points, -1, axis=0)], axis=1)
@@ -216,7 +218,7 @@ def segment_distance(a: np.ndarray, b: np.ndarray, segments: np.ndarray) -> np.n
     return np.where(crossing, 0.0, gap)
 
 
-def check_polygon(polygon: Sequence[Sequence[float]] | np.ndarray, name: str) -> np.ndarray:
+def check_polygon(polygon: Polygon, name: str) -> np.ndarray:
     """The polygon as ``[k, 2]`` float64, or a ValueError that says why it is none.
 
     Raises:
@@ -239,7 +241,7 @@ def check_polygon(polygon: Sequence[Sequence[float]] | np.ndarray, name: str) ->
         raise ValueError(f"{name} repeats its corner {corner}; leave the second one out")
     x, y = points.T
     area = 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
-    if area < 1e-3 * lengths.max() ** 2:
+    if area < 1e-6 * lengths.max() ** 2:
         raise ValueError(f"{name} has area {area:.3g}: its corners lie on a line; move one of them")
     n = len(points)
     gaps = segment_distance(sides[:, :2], sides[:, 2:], sides)

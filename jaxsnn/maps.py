@@ -22,10 +22,12 @@ from jaxsnn.world import N_SONARS, Params
 
 __all__ = ["make_map", "random_map", "stack_maps"]
 
-Polygon = Sequence[Sequence[float]]
+Number = int | float
+Point = Sequence[Number]
+Polygon = Sequence[Point] | np.ndarray
 
 
-def _positive(name: str, value: float, *, zero: bool = False) -> float:
+def _positive(name: str, value: Number, *, zero: bool = False) -> float:
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
         kind = "a finite number >= 0" if zero else "a finite number > 0"
         raise ValueError(f"{name} = {value} must be {kind}")
@@ -51,26 +53,26 @@ def _pad(name: str, rows: np.ndarray, size: int, fill: float = 0.0) -> np.ndarra
 
 def make_map(
     polygons: Sequence[Polygon] = (),
-    circles: Sequence[Sequence[float]] = (),
+    circles: Sequence[Point] = (),
     *,
-    bounds: Sequence[float] = (0.0, 0.0, 800.0, 600.0),
-    target: Sequence[float],
-    starts: Sequence[Sequence[float]],
-    start_probs: Sequence[float] | None = None,
-    arrival_radius: float = 35.0,
-    heading_spread: float = 45.0,
-    speed: float = 15.0,
-    robot_radius: float = 6.0,
-    sonar_angles: Sequence[float] = (60.0, 30.0, 0.0, -30.0, -60.0),
-    sonar_range: float = 300.0,
-    distance_range: float = 800.0,
-    polygon_velocity: Sequence[Sequence[float]] | None = None,
-    circle_velocity: Sequence[Sequence[float]] | None = None,
+    bounds: Point = (0.0, 0.0, 800.0, 600.0),
+    target: Point,
+    starts: Sequence[Point],
+    start_probs: Point | None = None,
+    arrival_radius: Number = 35.0,
+    heading_spread: Number = 45.0,
+    speed: Number = 15.0,
+    robot_radius: Number = 6.0,
+    sonar_angles: Point = (60.0, 30.0, 0.0, -30.0, -60.0),
+    sonar_range: Number = 300.0,
+    distance_range: Number = 800.0,
+    polygon_velocity: Sequence[Point] | None = None,
+    circle_velocity: Sequence[Point] | None = None,
     patrol_steps: int = 1,
-    sonar_noise: float = 0.0,
-    distance_noise: float = 0.0,
-    angle_noise: float = 0.0,
-    sonar_stuck: dict[int, float] | None = None,
+    sonar_noise: Number = 0.0,
+    distance_noise: Number = 0.0,
+    angle_noise: Number = 0.0,
+    sonar_stuck: dict[int, Number] | None = None,
     max_segments: int = 40,
     max_circles: int = 8,
     max_starts: int = 2,
@@ -161,7 +163,7 @@ def make_map(
             )
         failed[index], stuck[index] = True, value
 
-    def velocities(name: str, given: Sequence[Sequence[float]] | None, n: int) -> np.ndarray:
+    def velocities(name: str, given: Sequence[Point] | None, n: int) -> np.ndarray:
         rows = np.zeros((n, 2)) if given is None else _rows(name, given, 2)
         if len(rows) != n:
             raise ValueError(f"{name} has {len(rows)} rows for {n} obstacles; give one for each")
@@ -249,18 +251,19 @@ def stack_maps(maps: Sequence[Params]) -> Params:
     """Maps of equal padding as one Params with a leading axis, ready for ``jax.vmap``."""
     if not maps:
         raise ValueError("stack_maps needs at least one map, got none")
-    return jax.tree.map(lambda *leaves: jnp.stack(leaves), *maps)
+    # On the host: stacking on the device would compile once for each shape.
+    return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *maps)
 
 
 def random_map(
     key: Key[Array, ""],
     *,
     n_obstacles: tuple[int, int] = (4, 8),
-    obstacle_radius: tuple[float, float] = (25.0, 55.0),
-    size: tuple[float, float] = (800.0, 600.0),
-    min_distance: float = 250.0,
-    start_radius: float = 30.0,
-    clearance: float = 20.0,
+    obstacle_radius: tuple[Number, Number] = (25.0, 55.0),
+    size: tuple[Number, Number] = (800.0, 600.0),
+    min_distance: Number = 250.0,
+    start_radius: Number = 30.0,
+    clearance: Number = 20.0,
     attempts: int = 1000,
     **constants: Any,
 ) -> Params:

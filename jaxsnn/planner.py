@@ -17,6 +17,8 @@ from jaxsnn.world import Params
 
 __all__ = ["Obstacles", "PathField", "check_pose", "path_field", "shortest_path"]
 
+Point = Sequence[int | float] | np.ndarray
+
 # Kept between a planned path and the exact reach of an obstacle, so that rounding cannot block it
 # [px].
 _SLACK = 1e-3
@@ -137,7 +139,7 @@ class PathField:
         starts = np.asarray(starts, np.float64)
         return np.array([self._from(start)[0] for start in starts])
 
-    def path(self, start: Sequence[float] | np.ndarray) -> np.ndarray:
+    def path(self, start: Point) -> np.ndarray:
         """Way points ``[k, 2]`` from a start to the centre of the target.
 
         Raises:
@@ -173,7 +175,7 @@ class PathField:
         return math.inf, -1
 
 
-def path_field(params: Params, *, clearance: float | None = None) -> PathField:
+def path_field(params: Params, *, clearance: int | float | None = None) -> PathField:
     """Plan from everywhere: a visibility graph over the grown obstacles, and Dijkstra from the
     target.
 
@@ -223,7 +225,7 @@ def path_field(params: Params, *, clearance: float | None = None) -> PathField:
 
 
 def shortest_path(
-    params: Params, start: Sequence[float], *, clearance: float | None = None
+    params: Params, start: Point, *, clearance: int | float | None = None
 ) -> tuple[float, np.ndarray]:
     """Length [px] and way points ``[k, 2]`` of the shortest collision-free path from one start.
 
@@ -241,7 +243,7 @@ def shortest_path(
     return float(field.lengths(np.asarray([start]))[0]), points
 
 
-def check_pose(params: Params, position: Sequence[float]) -> None:
+def check_pose(params: Params, position: Point) -> None:
     """Refuse a position where the robot would stand in an obstacle or in a wall.
 
     Raises:

@@ -27,13 +27,13 @@ NAMES = {1: "Scenario 1", 2: "Scenario 2", 3: "Scenario 3"}
 MAX_STEPS = 200
 
 
-def _box(x: float, y: float, width: float, height: float) -> list[tuple[float, float]]:
+def _box(x: int, y: int, width: int, height: int) -> list[tuple[float, float]]:
     """Corners of an upright rectangle around (x, y)."""
     w, h = width / 2, height / 2
     return [(x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h)]
 
 
-def _regular(x: float, y: float, radius: float, corners: int) -> list[tuple[float, float]]:
+def _regular(x: int, y: int, radius: int, corners: int) -> list[tuple[float, float]]:
     """Corners of a regular polygon that stands on a side."""
     first = -math.pi / 2 + math.pi / corners
     angles = [first + 2 * math.pi * i / corners for i in range(corners)]

@@ -129,7 +129,9 @@ def obstacles_at(
     return segments, jnp.concatenate([centres, params.circles[:, 2:]], axis=1)
 
 
-def reset(key: Key[Array, ""], params: Params, *, circle: int | Array | None = None) -> State:
+def reset(
+    key: Key[Array, ""], params: Params, *, circle: int | Int[Array, ""] | None = None
+) -> State:
     """A robot at a uniform point of a start circle, facing the target within ``heading_spread``.
 
     Args:
@@ -240,7 +242,7 @@ def _heading_and_move(
 
 def step(
     state: State,
-    steering: float | Float[Array, ""],
+    steering: int | float | Float[Array, ""],
     params: Params,
     *,
     others: Discs | None = None,
@@ -328,6 +330,8 @@ def step(
 def _seen_by_each(states: State, moves: Array, active: Array) -> Discs:
     """For each robot the discs of all others: leaves ``[r, r, ...]``, itself masked out."""
     n = active.shape[0]
+    if n == 0:
+        raise ValueError("there are 0 robots; states and active need at least one robot")
     centres = jnp.stack([states.x, states.y], axis=1)
     return Discs(
         centres=jnp.broadcast_to(centres[None], (n, n, 2)),

@@ -221,7 +221,7 @@ def gap_closure(
         baseline, where the share has no meaning.
 
     Example:
-        >>> gap_closure(0.85, 0.75, 0.875)
+        >>> gap_closure(0.75, 0.5, 0.8125)
         0.8
     """
     a, b, o = (float(np.mean(np.asarray(v, dtype=np.float64))) for v in (model, baseline, oracle))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
+from typing import Any
 
 import numpy as np
 from jax.typing import ArrayLike
@@ -11,13 +12,15 @@ from matplotlib.figure import Figure
 
 __all__ = ["plot_channel_weights", "plot_confusion", "plot_gate", "plot_training"]
 
+Values = ArrayLike | Sequence[Any]
+
 CLEAN = "#0072b2"
 FAILED = "#d55e00"
 LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
 
 
 def plot_confusion(
-    matrix: ArrayLike, classes: Sequence[str], *, title: str = "Confusion matrix"
+    matrix: Values, classes: Sequence[str], *, title: str = "Confusion matrix"
 ) -> Figure:
     """Draw a confusion matrix: colour is the share of the true class, numbers are counts.
 
@@ -58,8 +61,8 @@ def plot_confusion(
 
 
 def plot_gate(
-    weights: ArrayLike,
-    mask: ArrayLike,
+    weights: Values,
+    mask: Values,
     channels: Sequence[str],
     *,
     title: str = "Fusion weights of corrupted examples",
@@ -116,7 +119,7 @@ def plot_gate(
 
 
 def plot_channel_weights(
-    models: Mapping[str, tuple[ArrayLike, ArrayLike]],
+    models: Mapping[str, tuple[Values, Values]],
     channel: str,
     channels: Sequence[str],
     *,
@@ -175,9 +178,7 @@ def plot_channel_weights(
     return figure
 
 
-def plot_training(
-    curves: Mapping[str, Mapping[str, ArrayLike]], *, title: str = "Training"
-) -> Figure:
+def plot_training(curves: Mapping[str, Mapping[str, Values]], *, title: str = "Training") -> Figure:
     """Draw training curves, one panel per metric and one line per model.
 
     Args:
@@ -212,7 +213,7 @@ def plot_training(
     return figure
 
 
-def _weights_and_mask(weights: ArrayLike, mask: ArrayLike, k: int) -> tuple[np.ndarray, np.ndarray]:
+def _weights_and_mask(weights: Values, mask: Values, k: int) -> tuple[np.ndarray, np.ndarray]:
     w, m = np.asarray(weights, dtype=np.float64), np.asarray(mask, dtype=bool)
     if w.ndim != 2 or w.shape[1] != k or m.shape != w.shape:
         raise ValueError(

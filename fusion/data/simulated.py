@@ -143,7 +143,9 @@ def load_simulated(config: SimulatedConfig | None = None, *, seed: int = 0) -> D
     )
 
 
-def bayes_accuracy(config: SimulatedConfig, sensors: Sequence[int] | None = None) -> float:
+def bayes_accuracy(
+    config: SimulatedConfig, sensors: Sequence[int] | np.ndarray | None = None
+) -> float:
     r"""Accuracy of the best possible classifier that sees some of the sensors.
 
     .. math:: P = \sum_{n=0}^{C-1} \binom{C-1}{n} \frac{(-1)^n}{n+1}

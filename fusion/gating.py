@@ -1,0 +1,157 @@
+"""Fusion weights: how they are computed from the features, normalized, and applied.
+
+Arrays with a sensor axis have it first for features (``[branch, batch, feature]``) and last for
+weights (``[batch, branch]``), as a user reads them: one row of weights per example.
+"""
+
+from __future__ import annotations
+
+from typing import Literal
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float
+
+__all__ = [
+    "Gate",
+    "Normalizer",
+    "apply_weights",
+    "drop_modalities",
+    "embrace",
+    "normalize",
+    "oracle_weights",
+]
+
+Normalizer = Literal["softmax", "softmax_sigmoid"]
+
+
+def normalize(scores: Float[Array, "*b k"], normalizer: Normalizer) -> Float[Array, "*b k"]:
+    r"""Turn K scores into weights that are positive and sum to one.
+
+    .. math::
+        \text{softmax:} \quad w_k = e^{s_k} / \textstyle\sum_j e^{s_j}
+        \qquad
+        \text{softmax\_sigmoid:} \quad w_k = e^{\sigma(s_k)} / \textstyle\sum_j e^{\sigma(s_j)}
+
+    Args:
+        scores: one score per sensor, any leading axes.
+        normalizer: ``"softmax_sigmoid"`` is the source as printed (section 3.2.1). Its weights are
+            confined: for K = 9 to [0.044, 0.254], so it cannot express the weights of 0.33 to 0.45
+            that the source's Figure 3.7 shows. ``"softmax"`` can.
+
+    Returns:
+        Weights with the shape of `scores`.
+
+    Source: M. S. Shim (2020), section 3.2.1 and Equation 3.1.
+    """
+    if normalizer == "softmax_sigmoid":
+        scores = jax.nn.sigmoid(scores)
+    elif normalizer != "softmax":
+        raise ValueError(f"normalizer={normalizer!r}: expected 'softmax' or 'softmax_sigmoid'")
+    return jax.nn.softmax(scores, axis=-1)
+
+
+class Gate(nn.Module):
+    """The "FC-con" block: concatenated features, one hidden layer, one score per sensor.
+
+    ``[branch, batch, feature] -> [batch, branch]``; the last layer starts at zero, so that training
+    starts from equal weights.
+
+    Source: Patel et al. (IROS 2017), NetGated; M. S. Shim (2020), Figures 3.1 and 3.3.
+    """
+
+    width: int
+    normalizer: Normalizer
+
+    @nn.compact
+    def __call__(self, features: Float[Array, "k b f"]) -> Float[Array, "b k"]:
+        """Return the fusion weights of every example."""
+        k, b, _ = features.shape
+        joined = jnp.transpose(features, (1, 0, 2)).reshape(b, -1)
+        hidden = nn.relu(nn.Dense(self.width, name="fc_con")(joined))
+        scores = nn.Dense(k, kernel_init=nn.initializers.zeros, name="split")(hidden)
+        return normalize(scores, self.normalizer)
+
+
+def oracle_weights(failed: Bool[Array, "b k"]) -> Float[Array, "b k"]:
+    r"""The gate that is told which sensors failed: equal weights over the healthy ones.
+
+    .. math:: w_k = (1 - m_k) / \max\left(1, \textstyle\sum_j (1 - m_j)\right)
+
+    The upper bound that learned gates are measured against; it needs what no user has.
+    """
+    healthy = 1.0 - failed.astype(jnp.float32)
+    return healthy / jnp.maximum(1.0, jnp.sum(healthy, axis=-1, keepdims=True))
+
+
+def apply_weights(
+    features: Float[Array, "k b f"], weights: Float[Array, "b k"], fusion: str, scale: str
+) -> Float[Array, "b g"]:
+    r"""Weight the features and join them.
+
+    .. math::
+        h = \big\Vert_k K w_k z_k \quad (\text{concat}) \qquad
+        h = \textstyle\sum_k w_k z_k \quad (\text{sum})
+
+    The factor K makes equal weights the identity, so that a gated network and the baseline start
+    from the same function.
+    """
+    k, b, _ = features.shape
+    if scale == "max":
+        gain = weights / jnp.max(weights, axis=-1, keepdims=True)
+    elif scale == "mean":
+        gain = k * weights
+    else:
+        raise ValueError(f"scale={scale!r}: expected 'mean' or 'max'")
+    gated = features * gain.T[:, :, None]
+    if fusion == "concat":
+        return jnp.transpose(gated, (1, 0, 2)).reshape(b, -1)
+    if fusion == "sum":
+        return jnp.mean(gated, axis=0)
+    raise ValueError(f"fusion={fusion!r}: expected 'concat' or 'sum'")
+
+
+def drop_modalities(
+    key: Array, features: Float[Array, "k b f"], rate: float
+) -> Float[Array, "k b f"]:
+    """Modality dropout: each sensor's features are zeroed with probability `rate`, never all.
+
+    The kept ones are scaled by K over their number, as path drop in AVOD divides by the kept count.
+
+    Source: Neverova et al. (2016), ModDrop; Ku et al. (2018), path drop.
+    """
+    k, b, _ = features.shape
+    draw_key, spare_key = jax.random.split(key)
+    keep = jax.random.uniform(draw_key, (k, b)) >= rate
+    spare = jax.nn.one_hot(jax.random.randint(spare_key, (b,), 0, k), k, axis=0, dtype=bool)
+    keep = jnp.where(jnp.any(keep, axis=0, keepdims=True), keep, spare)
+    scale = k / jnp.sum(keep, axis=0, keepdims=True)
+    return features * (keep * scale)[:, :, None]
+
+
+def embrace(
+    features: Float[Array, "k b f"], key: Array | None, keep: Float[Array, "b k"] | None = None
+) -> Float[Array, "b f"]:
+    r"""EmbraceNet fusion: each feature is taken from one sensor, drawn at random.
+
+    .. math:: h_i = z_{r_i, i}, \quad r_i \sim \text{Categorical}(p)
+
+    Without a key (at inference) the expectation :math:`\sum_k p_k z_{k,i}` is used, so that the
+    result is a function of the input alone.
+
+    Args:
+        features: docked features of the K sensors.
+        key: PRNG key of the draws, or None for the expectation.
+        keep: availability of each sensor, ``[batch, branch]``; all available when None.
+
+    Source: Choi and Lee (2019), EmbraceNet. Deviation: the expectation at inference.
+    """
+    k, b, f = features.shape
+    weights = jnp.ones((b, k)) if keep is None else keep
+    p = weights / jnp.maximum(1e-9, jnp.sum(weights, axis=-1, keepdims=True))
+    if key is None:
+        return jnp.einsum("bk,kbf->bf", p, features)
+    choice = jax.random.categorical(key, jnp.log(p + 1e-9)[:, None, :], axis=-1, shape=(b, f))
+    selected = jax.nn.one_hot(choice, k, axis=0, dtype=features.dtype)
+    return jnp.sum(selected * features, axis=0)

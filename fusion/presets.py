@@ -1,0 +1,91 @@
+"""The settings of record: one recipe per data set, shared by all compared models."""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import NamedTuple
+
+from fusion.data.dataset import Dataset
+from fusion.encoders import EncoderConfig, reading_levels
+from fusion.losses import LossParams
+from fusion.models import ModelConfig, match_parameters
+from fusion.train import HyperParams, TrainConfig
+
+__all__ = ["PRESETS", "Preset", "preset"]
+
+
+class Preset(NamedTuple):
+    """A network and how it is trained."""
+
+    model: ModelConfig
+    train: TrainConfig
+    hyper: HyperParams
+
+
+# Chosen on validation splits (four held-out subjects; held-out rows), never on a test set:
+# docs/argate.md tells which settings were compared and results/study_argate.json holds the numbers.
+_HAR = Preset(
+    ModelConfig(head_widths=(128,), dropout=0.2),
+    TrainConfig(epochs=15, batch_size=64, uniform_floor=1.0, label_smoothing=0.05),
+    HyperParams(3e-3, 1e-3, LossParams(alpha=1.0, beta=1.0, tau=0.5, anchor=0.3)),
+)
+_DRIVER = Preset(
+    ModelConfig(encoder=EncoderConfig(features=24), head_widths=(128, 128), dropout=0.05),
+    TrainConfig(epochs=8, batch_size=128, uniform_floor=1.0, label_smoothing=0.0),
+    HyperParams(4e-3, 1e-4, LossParams(alpha=1.0, beta=1.0, tau=0.5, anchor=0.3)),
+)
+# Small enough for demo, tests and CI.
+_SIMULATED = Preset(
+    ModelConfig(
+        encoder=EncoderConfig(features=16, conv_features=(8, 16)),
+        gate_width=16,
+        head_widths=(32,),
+        dropout=0.1,
+    ),
+    TrainConfig(epochs=10, batch_size=64, uniform_floor=1.0, label_smoothing=0.0),
+    HyperParams(3e-3, 1e-4, LossParams(alpha=1.0, beta=1.0, tau=0.5, anchor=0.3)),
+)
+_BY_DATASET = {"har": _HAR, "driver": _DRIVER, "simulated": _SIMULATED}
+_QUICK_EPOCHS = {"har": 5, "driver": 2, "simulated": 5}
+
+PRESETS = ("quick", "paper")
+
+
+def preset(dataset: Dataset, model: str = "argate_l", name: str = "paper") -> Preset:
+    """The settings of record for a data set, its head width matched in parameters to ARGate-L.
+
+    Args:
+        dataset: gives the sizes.
+        model: a name in `fusion.models.MODELS`.
+        name: ``"paper"`` for the record, ``"quick"`` for the same with few epochs.
+
+    Returns:
+        Model, training and hyper-parameters; change fields with `dataclasses.replace` and
+        `_replace`.
+
+    Raises:
+        ValueError: unknown preset, model or data set.
+    """
+    if name not in PRESETS:
+        raise ValueError(f"preset={name!r} is not known; known: {', '.join(PRESETS)}")
+    if dataset.name not in _BY_DATASET:
+        raise ValueError(
+            f"no preset for the data set {dataset.name!r} (known: {', '.join(_BY_DATASET)}); build "
+            "ModelConfig, TrainConfig and HyperParams yourself"
+        )
+    base = _BY_DATASET[dataset.name]
+    reference = dataclasses.replace(
+        base.model,
+        model="argate_l",
+        n_sensors=dataset.n_channels,
+        n_times=dataset.n_time,
+        n_classes=dataset.n_classes,
+    )
+    if dataset.n_time == 1:
+        encoder = dataclasses.replace(base.model.encoder, levels=reading_levels(dataset.train_x))
+        reference = dataclasses.replace(reference, encoder=encoder)
+    config = match_parameters(dataclasses.replace(reference, model=model), reference)
+    train = base.train
+    if name == "quick":
+        train = dataclasses.replace(train, epochs=_QUICK_EPOCHS[dataset.name])
+    return Preset(config, train, base.hyper)

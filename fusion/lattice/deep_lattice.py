@@ -178,9 +178,10 @@ def init(key: Key[Array, ""], config: DeepLatticeConfig) -> DeepLatticeParams:
 
     Example:
         >>> config = DeepLatticeConfig(3, monotonicity=(-1, 0, 0), input_range=(0.0, 4.0))
-        >>> params = init(jax.random.key(0), config)
-        >>> low = apply(params, config, jnp.array([0.5, 1.0, 1.0]))
-        >>> bool(apply(params, config, jnp.array([3.0, 1.0, 1.0])) < low)
+        >>> params = jax.jit(init, static_argnums=1)(jax.random.key(0), config)
+        >>> x = jnp.array([[0.5, 1.0, 1.0], [3.0, 1.0, 1.0]])
+        >>> y = jax.jit(apply, static_argnums=1)(params, config, x)
+        >>> bool(y[1] < y[0])
         True
     """
     keys = jax.random.split(key, 4)

@@ -25,11 +25,13 @@ __all__ = ["interior", "project_vertices", "violation"]
 def interior(config: LatticeConfig, signs: np.ndarray | Array) -> np.ndarray | Array:
     """A lattice `[*sizes]` with slack >= 1 in every order and trust inequality, from 0 upwards."""
     index = np.indices(config.sizes).astype(np.float32)
-    # A product of two indices is at most this steep; the order terms must outweigh it.
-    steep = 1 + sum(max(config.sizes[m], config.sizes[c]) - 1 for m, c, _ in config.edgeworth_trust)
+    # A product of two centred indices is at most this steep; order terms must outweigh it.
+    sizes = config.sizes
+    steep = 1 + 0.5 * sum(max(sizes[m], sizes[c]) - 1 for m, c, _ in config.edgeworth_trust)
     shape = np.zeros(config.sizes, np.float32)
     for main, conditional, direction in config.edgeworth_trust:
-        shape = shape + np.float32(direction) * index[main] * index[conditional]
+        pair = [index[axis] - np.float32(0.5 * (sizes[axis] - 1)) for axis in (main, conditional)]
+        shape = shape + np.float32(direction) * pair[0] * pair[1]
     for axis, sign in enumerate(config.unimodality or ()):
         shape = shape + np.float32(steep * sign) * np.abs(index[axis] - config.centre(axis))
     shape = shape - shape.min()

@@ -42,23 +42,18 @@ def windows(t: int) -> jax.Array:
 
 
 @jax.jit
-def corrupt_all_kinds(key: jax.Array, x: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
-    return {kind: corrupt(key, x, PROTOCOL, kind) for kind in FAILURE_KINDS}
-
-
-@jax.jit
-def fail_all_channels(key: jax.Array, x: jax.Array) -> dict[str, jax.Array]:
-    return {kind: apply_failure(key, x, ALL, kind) for kind in FAILURE_KINDS}
-
-
-@functools.cache
-def corrupted(seed: int, t: int) -> dict[str, tuple[jax.Array, jax.Array]]:
-    return corrupt_all_kinds(jax.random.key(seed), windows(t))
+def fail(key: jax.Array, x: jax.Array, mask: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
+    """Every kind, on some channels and on all of them."""
+    return {
+        kind: (apply_failure(key, x, mask, kind), apply_failure(key, x, ALL, kind))
+        for kind in FAILURE_KINDS
+    }
 
 
 @functools.cache
-def failed(t: int) -> dict[str, jax.Array]:
-    return fail_all_channels(jax.random.key(9), windows(t))
+def failed(t: int) -> dict[str, tuple[jax.Array, jax.Array]]:
+    mask = run_mask(jax.random.key(5), N, PROTOCOL)
+    return fail(jax.random.key(9), windows(t), mask)
 
 
 @pytest.mark.parametrize(
@@ -105,21 +100,32 @@ def test_every_failing_set_and_every_count_is_equally_likely() -> None:
 @pytest.mark.parametrize("kind", FAILURE_KINDS)
 def test_only_failed_channels_change(kind: str, t: int) -> None:
     x = windows(t)
-    y, mask = corrupted(5, t)[kind]
-    assert y.shape == x.shape and y.dtype == x.dtype and mask.shape == (N, K)
+    y, full = failed(t)[kind]
+    mask = np.asarray(run_mask(jax.random.key(5), N, PROTOCOL))
+    assert y.shape == x.shape and y.dtype == x.dtype
     same = np.asarray((y == x).all(axis=2))
-    assert same[~np.asarray(mask)].all()
+    assert same[~mask].all()
+    np.testing.assert_array_equal(np.asarray(y)[mask], np.asarray(full)[mask])
     assert np.isfinite(np.asarray(y)).all()
-    changed = 1.0 - same[np.asarray(mask)].mean()
+    changed = 1.0 - same[mask].mean()
     # A burst misses a lone sample half of the time; the other kinds nearly always show.
     assert changed > (0.35 if kind == "dropout" and t == 1 else 0.85)
-    # The failed channels depend on the key, not on the kind.
-    np.testing.assert_array_equal(mask, corrupted(5, 1)["uniform"][1])
-    assert not np.array_equal(mask, corrupted(6, t)[kind][1])
+
+
+def test_the_mask_depends_on_the_key_and_not_on_the_kind() -> None:
+    run = jax.jit(corrupt, static_argnums=(2, 3))
+    x = windows(1)
+    y, mask = run(jax.random.key(5), x, PROTOCOL, "uniform")
+    zero, same = run(jax.random.key(5), x, PROTOCOL, "zero")
+    np.testing.assert_array_equal(mask, same)
+    np.testing.assert_array_equal(zero[:, :, 0] == 0.0, mask)
+    other, moved = run(jax.random.key(6), x, PROTOCOL, "uniform")
+    assert not np.array_equal(mask, moved) and not np.array_equal(y, other)
+    np.testing.assert_array_equal(run(jax.random.key(5), x, PROTOCOL, "uniform")[0], y)
 
 
 def failed_all(kind: str, t: int) -> tuple[np.ndarray, np.ndarray]:
-    return np.asarray(windows(t), np.float64), np.asarray(failed(t)[kind], np.float64)
+    return np.asarray(windows(t), np.float64), np.asarray(failed(t)[kind][1], np.float64)
 
 
 def test_noise_has_the_distribution_of_the_source() -> None:
@@ -183,7 +189,7 @@ def test_gain_and_clip() -> None:
 def test_severity_is_the_way_from_clean_to_failed(kind: str) -> None:
     x, key = windows(32), jax.random.key(9)
     run = jax.jit(lambda s: apply_failure(key, x, ALL, kind, severity=s))
-    full = np.asarray(failed(32)[kind])
+    full = np.asarray(failed(32)[kind][1])
     np.testing.assert_array_equal(run(jnp.float32(0.0)), x)
     np.testing.assert_allclose(run(jnp.float32(1.0)), full, atol=1e-6)
     np.testing.assert_allclose(run(jnp.float32(0.25)), 0.75 * x + 0.25 * full, atol=1e-6)

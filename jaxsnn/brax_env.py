@@ -1,0 +1,198 @@
+"""The robot world as a brax ``Env``: brax's wrappers and learners run on it; the one file with
+brax.
+
+One robot is one environment; brax's wrappers vmap it. The observation, the reward and the meaning
+of an action are those of :func:`jaxsnn.ppo.navigation_env`. Importing brax takes seconds and prints
+two lines to stdout, so nothing else in the package imports this module.
+
+>>> from jaxsnn import scenarios
+>>> from jaxsnn.brax_env import NavigationEnv  # doctest: +SKIP
+>>> env = NavigationEnv(scenarios.scenario(1))  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Callable, Iterator, Sequence
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from brax.envs.base import Env, State, Wrapper
+from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+from jaxtyping import Array
+
+from jaxsnn import ppo, world
+
+__all__ = ["FreshResetWrapper", "NavigationEnv", "brax_compatibility", "wrap_for_training"]
+
+
+class PipelineState(NamedTuple):
+    """What a robot carries: its pose, and a key for its sensors' noise as raw words.
+
+    brax's wrappers select between states with ``where`` after a reshape, which typed keys do not
+    take.
+    """
+
+    robot: world.State  # its key replaced by words [2] uint32
+    params: world.Params
+
+
+def _typed(key: Array) -> Array:
+    """A typed key from either kind: brax hands out raw uint32 words."""
+    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        return key
+    return jax.random.wrap_key_data(key)
+
+
+def _pack(robot: world.State) -> world.State:
+    return robot._replace(key=jax.random.key_data(robot.key))
+
+
+def _unpack(robot: world.State) -> world.State:
+    return robot._replace(key=jax.random.wrap_key_data(robot.key))
+
+
+class NavigationEnv(Env):
+    """One robot on one map.
+
+    Observation ``[8]``: :func:`jaxsnn.ppo.observation`. Action ``[1]`` in [-1, 1]: 1 steers 45
+    degrees to the left. Reward: :func:`jaxsnn.ppo.navigation_reward`. ``done`` is 1.0 after
+    arrival, collision or a state that is not finite; ``metrics`` say which. The limit on steps is
+    brax's ``episode_length``.
+
+    Args:
+        params: the map; it travels in ``pipeline_state`` and may be changed there.
+    """
+
+    def __init__(self, params: world.Params) -> None:
+        self.params = params
+
+    def reset(self, rng: jax.Array) -> State:
+        """A robot in a start circle; ``rng`` may be a raw or a typed key."""
+        robot = world.reset(_typed(rng), self.params)
+        zero = jnp.zeros((), jnp.float32)
+        return State(
+            pipeline_state=PipelineState(_pack(robot), self.params),
+            obs=ppo.observation(world.observe(robot, self.params), self.params),
+            reward=zero,
+            done=zero,
+            metrics={"arrived": zero, "collided": zero, "failed": zero},
+            info={},
+        )
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """One control step of 15 pixels."""
+        held: Any = state.pipeline_state
+        before, params = _unpack(held.robot), held.params
+        steering = ppo.STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
+        robot, outcome = world.step(before, steering, params)
+        flags = {
+            name: jnp.asarray(getattr(outcome, name)).astype(jnp.float32)
+            for name in ("arrived", "collided", "failed")
+        }
+        return state.replace(
+            pipeline_state=PipelineState(_pack(robot), params),
+            obs=ppo.observation(world.observe(robot, params), params),
+            reward=ppo.navigation_reward(before, robot, outcome, params),
+            done=flags["arrived"] + flags["collided"] + flags["failed"],
+            metrics={**state.metrics, **flags},
+        )
+
+    @property
+    def observation_size(self) -> int:
+        """Five sonars, distance, sine and cosine of the angle."""
+        return ppo.OBSERVATION_SIZE
+
+    @property
+    def action_size(self) -> int:
+        """Steering."""
+        return 1
+
+    @property
+    def backend(self) -> str:
+        """No physics engine of brax is behind this."""
+        return "kinematic"
+
+
+class FreshResetWrapper(Wrapper):
+    """Start the next episode anywhere in the start circles.
+
+    brax's own ``AutoResetWrapper`` goes back to the first state of each environment for the whole
+    run. Wraps a batched environment.
+    """
+
+    def reset(self, rng: jax.Array) -> State:
+        """Reset all environments and keep a key for each."""
+        state = self.env.reset(rng)
+        words = (
+            rng if not jnp.issubdtype(rng.dtype, jax.dtypes.prng_key) else jax.random.key_data(rng)
+        )
+        state.info["reset_rng"] = words
+        return state
+
+    def step(self, state: State, action: jax.Array) -> State:
+        """Step all, then reset those that are done."""
+        if "steps" in state.info:
+            over = state.done.astype(bool)
+            steps = jnp.where(over, jnp.zeros_like(state.info["steps"]), state.info["steps"])
+            state.info.update(steps=steps)
+        state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
+        split = jax.vmap(lambda k: jax.random.key_data(jax.random.split(_typed(k))))
+        words = split(state.info["reset_rng"])
+        fresh = self.env.reset(words[:, 0])
+        done = state.done.astype(bool)
+
+        def choose(new: Array, old: Array) -> Array:
+            return jnp.where(done.reshape(-1, *[1] * (new.ndim - 1)), new, old)
+
+        info = {**state.info, "reset_rng": words[:, 1]}
+        return state.replace(
+            pipeline_state=jax.tree.map(choose, fresh.pipeline_state, state.pipeline_state),
+            obs=choose(fresh.obs, state.obs),
+            info=info,
+        )
+
+
+def wrap_for_training(
+    env: Env,
+    episode_length: int = 200,
+    action_repeat: int = 1,
+    randomization_fn: Callable[..., Any] | None = None,
+) -> Wrapper:
+    """Vmap, episode limit and fresh resets; pass it as ``wrap_env_fn`` to brax's learners.
+
+    Raises:
+        ValueError: ``randomization_fn`` is given: there is no brax system to randomize. Make
+            one :class:`NavigationEnv` for each map instead.
+    """
+    if randomization_fn is not None:
+        raise ValueError(
+            "randomization_fn needs a brax system, and this world has none; vary "
+            "NavigationEnv.params instead"
+        )
+    return FreshResetWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+
+
+def _device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
+    """A copy for each device along a new leading axis, as ``pmap`` takes it."""
+    n = len(devices)
+    return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *jnp.shape(a))), x)
+
+
+@contextlib.contextmanager
+def brax_compatibility() -> Iterator[None]:
+    """Lend jax the function that brax 0.14.2's PPO and SAC call and that jax 0.10 has dropped.
+
+    >>> with brax_compatibility():  # doctest: +SKIP
+    ...     brax.training.agents.ppo.train.train(env, wrap_env_fn=wrap_for_training, ...)
+    """
+    # An attribute lookup on jax raises for what it has dropped, so look in the module's own names.
+    missing = "device_put_replicated" not in vars(jax)
+    if missing:
+        jax.device_put_replicated = _device_put_replicated
+    try:
+        yield
+    finally:
+        if missing:
+            del jax.device_put_replicated

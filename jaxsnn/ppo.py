@@ -1,0 +1,431 @@
+"""Proximal policy optimization in one compiled program: the modern reference on the same world.
+
+``make_train(config, env)`` gives ``train(key)``, a pure function of a key: vmap it over seeds, jit
+it as a whole. Environments are pairs of pure functions (:class:`Env`); :func:`navigation_env` wraps
+the robot world. Robots that end a trial start the next one at once, from a fresh random start.
+
+>>> import jax
+>>> from jaxsnn import ppo, scenarios
+>>> env = ppo.navigation_env(scenarios.scenario(1))
+>>> train = jax.jit(ppo.make_train(ppo.Config(n_updates=100), env))
+>>> result = train(jax.random.key(0))  # doctest: +SKIP
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+import optax
+from jaxtyping import Array, Float, Key
+
+from jaxsnn import world
+
+__all__ = [
+    "ActorCritic",
+    "Config",
+    "Env",
+    "Result",
+    "Rollout",
+    "Transition",
+    "act",
+    "evaluate",
+    "gae",
+    "make_train",
+    "navigation_env",
+    "navigation_reward",
+    "observation",
+]
+
+OBSERVATION_SIZE = world.N_SONARS + 3
+# A full action turns the robot by this much [deg].
+STEERING_SCALE = 45.0
+
+
+class Transition(NamedTuple):
+    """What an environment answers to an action."""
+
+    state: Any
+    obs: Array  # [o]
+    reward: Array  # []
+    terminated: Array  # [] bool: the task is over, nothing follows
+    truncated: Array  # [] bool: out of steps, the value of what follows still counts
+    success: Array  # [] bool
+
+
+class Env(NamedTuple):
+    """An environment as two pure functions."""
+
+    reset: Callable[[Array], tuple[Any, Array]]  # key -> (state, obs)
+    step: Callable[[Any, Array], Transition]  # (state, action [a]) -> Transition
+    action_size: int
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Sizes and constants; static."""
+
+    n_envs: int = 8
+    n_steps: int = 64
+    n_updates: int = 150
+    n_epochs: int = 4
+    n_minibatches: int = 4
+    learning_rate: float = 1e-3
+    anneal: bool = True
+    discount: float = 0.98
+    gae_lambda: float = 0.95
+    clip: float = 0.2
+    value_coef: float = 0.5
+    entropy_coef: float = 0.0
+    max_grad_norm: float = 0.5
+    hidden: tuple[int, ...] = (64, 64)
+    initial_std: float = 0.6
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that do not fit together."""
+        for name in ("n_envs", "n_steps", "n_updates", "n_epochs", "n_minibatches"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name} = {getattr(self, name)} must be at least 1")
+        if (self.n_envs * self.n_steps) % self.n_minibatches:
+            raise ValueError(
+                f"n_envs * n_steps = {self.n_envs * self.n_steps} transitions do not split into "
+                f"n_minibatches = {self.n_minibatches} equal parts; change one of them"
+            )
+        if not (0 < self.learning_rate < math.inf and 0 <= self.discount <= 1):
+            raise ValueError(
+                f"learning_rate = {self.learning_rate} must be > 0 and discount = {self.discount} "
+                "in [0, 1]"
+            )
+
+
+class Rollout(NamedTuple):
+    """Means over one update, leaves ``[n_updates]`` in the result of a training."""
+
+    episodes: Array  # trials that ended
+    successes: Array  # trials that ended well
+    reward: Array  # mean reward of a step
+    value_loss: Array
+    policy_loss: Array
+    entropy: Array
+    kl: Array  # estimate of the divergence from the policy that acted
+    clip_share: Array  # transitions at which the ratio was clipped
+
+
+class Result(NamedTuple):
+    """What ``train`` returns."""
+
+    params: Any
+    metrics: Rollout
+
+
+class ActorCritic(nn.Module):
+    """Two tanh networks: mean and log deviation of a Gaussian action, and the value."""
+
+    action_size: int
+    hidden: tuple[int, ...]
+    initial_std: float
+
+    @nn.compact
+    def __call__(self, obs: Array) -> tuple[Array, Array, Array]:
+        """Mean ``[a]``, log deviation ``[a]``, value ``[]``."""
+
+        def tower(size: int, scale: float) -> Array:
+            x = obs
+            for width in self.hidden:
+                x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
+            return nn.Dense(size, kernel_init=nn.initializers.orthogonal(scale))(x)
+
+        log_std = self.param(
+            "log_std", nn.initializers.constant(math.log(self.initial_std)), (self.action_size,)
+        )
+        return tower(self.action_size, 0.01), log_std, tower(1, 1.0)[..., 0]
+
+
+def _network(config: Config, env: Env) -> ActorCritic:
+    return ActorCritic(env.action_size, config.hidden, config.initial_std)
+
+
+def _log_prob(action: Array, mean: Array, log_std: Array) -> Array:
+    z = (action - mean) * jnp.exp(-log_std)
+    return jnp.sum(-0.5 * z**2 - log_std - 0.5 * math.log(2.0 * math.pi))
+
+
+def act(config: Config, env: Env, params: Any, obs: Float[Array, "o"]) -> Float[Array, "a"]:
+    """The action without exploration: the mean of the policy."""
+    apply: Any = _network(config, env).apply
+    return apply(params, obs)[0]
+
+
+def gae(
+    rewards: Float[Array, "t"],
+    values: Float[Array, "t"],
+    next_values: Float[Array, "t"],
+    terminated: Array,
+    ended: Array,
+    *,
+    discount: float,
+    gae_lambda: float,
+) -> Float[Array, "t"]:
+    r"""Generalized advantage estimates of one stream of transitions.
+
+    .. math:: \delta_t = r_t + \gamma V(s'_t) - V(s_t), \qquad
+        A_t = \delta_t + \gamma \lambda A_{t+1}
+
+    Symbols: :math:`\gamma` is ``discount``, :math:`\lambda` is ``gae_lambda``; :math:`V(s'_t)` is
+    ``next_values``, the value of the state that the action led to before any reset, and counts as 0
+    where ``terminated``; the sum stops where ``ended``.
+
+    Source: Schulman et al. (2016), Eq. 16.
+    """
+    alive = jnp.where(terminated, 0.0, 1.0).astype(rewards.dtype)
+    going = jnp.where(ended, 0.0, 1.0).astype(rewards.dtype)
+    delta = rewards + discount * alive * next_values - values
+
+    def back(after: Array, row: tuple[Array, Array]) -> tuple[Array, Array]:
+        d, g = row
+        here = d + discount * gae_lambda * g * after
+        return here, here
+
+    _, advantages = jax.lax.scan(back, jnp.zeros((), rewards.dtype), (delta, going), reverse=True)
+    return advantages
+
+
+def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
+    r"""PPO with the clipped objective, the whole run as one pure function of a key.
+
+    .. math:: L = \mathbb{E}\,\min(\rho A,\, \operatorname{clip}(\rho, 1 - c, 1 + c) A)
+        - c_v\,(V - \hat R)^2 + c_e H, \qquad \rho = \pi(a|s) / \pi_{\text{old}}(a|s)
+
+    Symbols: :math:`c` is ``config.clip``, :math:`c_v` is ``config.value_coef``, :math:`c_e` is
+    ``config.entropy_coef``; :math:`A` from :func:`gae`, normalized over each minibatch.
+
+    Args:
+        config: sizes and constants.
+        env: the environment, reset to a fresh start whenever an episode ends.
+
+    Returns:
+        ``train(key) -> Result``: network parameters, and metrics with leaves ``[n_updates]``.
+
+    Source: Schulman et al. (2017), Eq. 7 and 9; one jit for the run as in PureJaxRL (Lu et al.,
+        2022).
+    """
+    network = _network(config, env)
+    apply: Any = network.apply
+    n_gradients = config.n_updates * config.n_epochs * config.n_minibatches
+    rate: Any = config.learning_rate
+    if config.anneal:
+        rate = optax.linear_schedule(config.learning_rate, 0.0, n_gradients)
+    optimizer = optax.chain(
+        optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5)
+    )
+
+    def value_of(params: Any, obs: Array) -> Array:
+        return apply(params, obs)[2]
+
+    def robot_step(params: Any, state: Any, obs: Array, key: Array) -> tuple[Any, Array, Any]:
+        k_action, k_reset = jax.random.split(key)
+        mean, log_std, value = apply(params, obs)
+        action = mean + jnp.exp(log_std) * jax.random.normal(k_action, mean.shape, mean.dtype)
+        made = env.step(state, action)
+        ended = made.terminated | made.truncated
+        carry = jax.tree.map(
+            lambda a, b: jnp.where(ended, a, b), env.reset(k_reset), (made.state, made.obs)
+        )
+        row = {
+            "obs": obs,
+            "action": action,
+            "log_prob": _log_prob(action, mean, log_std),
+            "value": value,
+            "next_value": value_of(params, made.obs),
+            "reward": made.reward,
+            "terminated": made.terminated,
+            "ended": ended,
+            "success": made.success & ended,
+        }
+        return *carry, row
+
+    def loss(params: Any, batch: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
+        mean, log_std, value = jax.vmap(lambda o: apply(params, o))(batch["obs"])
+        log_prob = jax.vmap(_log_prob)(batch["action"], mean, log_std)
+        log_ratio = log_prob - batch["log_prob"]
+        ratio = jnp.exp(log_ratio)
+        gain = batch["advantage"]
+        gain = (gain - jnp.mean(gain)) / (jnp.std(gain) + 1e-8)
+        clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+        policy_loss = -jnp.mean(jnp.minimum(ratio * gain, clipped * gain))
+        value_loss = jnp.mean((value - batch["return"]) ** 2)
+        entropy = jnp.mean(jnp.sum(log_std, axis=-1)) + 0.5 * env.action_size * math.log(
+            2.0 * math.pi * math.e
+        )
+        total = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
+        return total, {
+            "value_loss": value_loss,
+            "policy_loss": policy_loss,
+            "entropy": entropy,
+            "kl": jnp.mean(ratio - 1.0 - log_ratio),
+            "clip_share": jnp.mean(jnp.abs(ratio - 1.0) > config.clip),
+        }
+
+    def minibatch(carry: tuple[Any, Any], batch: dict[str, Array]) -> tuple[tuple[Any, Any], Any]:
+        params, moments = carry
+        grads, info = jax.grad(loss, has_aux=True)(params, batch)
+        updates, moments = optimizer.update(grads, moments, params)
+        return (optax.apply_updates(params, updates), moments), info
+
+    def update(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Rollout]:
+        params, moments, states, obs, key = carry
+        key, k_act, k_shuffle = jax.random.split(key, 3)
+
+        def control_step(now: tuple[Any, Array], step_key: Array) -> tuple[Any, Any]:
+            keys = jax.random.split(step_key, config.n_envs)
+            states, obs, row = jax.vmap(robot_step, (None, 0, 0, 0))(params, *now, keys)
+            return (states, obs), row
+
+        (states, obs), rows = jax.lax.scan(
+            control_step, (states, obs), jax.random.split(k_act, config.n_steps)
+        )
+        advantage = jax.vmap(
+            lambda *row: gae(*row, discount=config.discount, gae_lambda=config.gae_lambda),
+            in_axes=1,
+            out_axes=1,
+        )(rows["reward"], rows["value"], rows["next_value"], rows["terminated"], rows["ended"])
+        data = {name: rows[name] for name in ("obs", "action", "log_prob")}
+        data |= {"advantage": advantage, "return": advantage + rows["value"]}
+        total = config.n_envs * config.n_steps
+        data = jax.tree.map(lambda a: a.reshape(total, *a.shape[2:]), data)
+
+        def epoch(carry: tuple[Any, Any], k: Array) -> tuple[tuple[Any, Any], Any]:
+            order = jax.random.permutation(k, total).reshape(config.n_minibatches, -1)
+            return jax.lax.scan(minibatch, carry, jax.tree.map(lambda a: a[order], data))
+
+        (params, moments), info = jax.lax.scan(
+            epoch, (params, moments), jax.random.split(k_shuffle, config.n_epochs)
+        )
+        metrics = Rollout(
+            episodes=jnp.sum(rows["ended"]),
+            successes=jnp.sum(rows["success"]),
+            reward=jnp.mean(rows["reward"]),
+            **{name: jnp.mean(value) for name, value in info.items()},
+        )
+        return (params, moments, states, obs, key), metrics
+
+    def train(key: Key[Array, ""]) -> Result:
+        k_init, k_reset, k_run = jax.random.split(key, 3)
+        states, obs = jax.vmap(env.reset)(jax.random.split(k_reset, config.n_envs))
+        params = network.init(k_init, obs[0])
+        carry = (params, optimizer.init(params), states, obs, k_run)
+        carry, metrics = jax.lax.scan(update, carry, None, config.n_updates)
+        return Result(carry[0], metrics)
+
+    return train
+
+
+# --- the robot world as an environment ---------------------------------------------------------
+
+
+class _Navigation(NamedTuple):
+    robot: world.State
+    length: Array  # path so far [px]
+    start: Array  # [2]
+
+
+def observation(reading: world.Reading, params: world.Params) -> Float[Array, "8"]:
+    """Readings in [-1, 1]: five sonars, the distance, and sine and cosine of the angle."""
+    angle = jnp.deg2rad(reading.angle)
+    rest = [reading.distance / params.distance_range, jnp.sin(angle), jnp.cos(angle)]
+    return jnp.concatenate([reading.sonar / params.sonar_range, jnp.stack(rest)])
+
+
+def navigation_reward(
+    before: world.State, after: world.State, outcome: world.Outcome, params: world.Params
+) -> Float[Array, ""]:
+    r"""Arrival +2, collision -2, and one for each 100 px that the target comes nearer.
+
+    .. math:: r = 2\,[\text{arrived}] - 2\,[\text{collided}] + (d_t - d_{t+1}) / 100
+
+    The last term sums to the distance covered towards the target and so favours no detour.
+    """
+
+    def distance(state: world.State) -> Array:
+        return jnp.hypot(params.target[0] - state.x, params.target[1] - state.y)
+
+    ends = jnp.where(outcome.arrived, 2.0, 0.0) - jnp.where(outcome.collided, 2.0, 0.0)
+    progress = (distance(before) - distance(after)) / 100.0
+    return ends.astype(progress.dtype) + progress
+
+
+def navigation_env(params: world.Params, *, max_steps: int = 200) -> Env:
+    """The robot world as an :class:`Env`; an action of 1 steers 45 degrees to the left.
+
+    Args:
+        params: the map.
+        max_steps: a trial that has not ended after so many control steps is truncated.
+
+    Raises:
+        ValueError: ``max_steps`` is below 1.
+    """
+    if max_steps < 1:
+        raise ValueError(f"max_steps = {max_steps} must be at least 1")
+
+    def reset(key: Array) -> tuple[_Navigation, Array]:
+        robot = world.reset(key, params)
+        obs = observation(world.observe(robot, params), params)
+        start = jnp.stack([robot.x, robot.y])
+        return _Navigation(robot, jnp.zeros_like(robot.x), start), obs
+
+    def step(state: _Navigation, action: Array) -> Transition:
+        steering = STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
+        robot, outcome = world.step(state.robot, steering, params)
+        terminated = outcome.arrived | outcome.collided
+        moved = jnp.hypot(robot.x - state.robot.x, robot.y - state.robot.y)
+        return Transition(
+            state=state._replace(robot=robot, length=state.length + moved),
+            obs=observation(world.observe(robot, params), params),
+            reward=navigation_reward(state.robot, robot, outcome, params),
+            terminated=terminated,
+            truncated=(robot.t >= max_steps) & ~terminated,
+            success=outcome.arrived,
+        )
+
+    return Env(reset, step, action_size=1)
+
+
+def evaluate(
+    config: Config, env: Env, params: Any, keys: Key[Array, "n"], *, max_steps: int
+) -> tuple[Any, Array, Array]:
+    """Episodes without exploration, frozen where they end.
+
+    Args:
+        config: the one that the parameters were trained with.
+        env: the environment, a :func:`navigation_env` for the path lengths to make sense.
+        params: ``Result.params``.
+        keys: one for each episode.
+        max_steps: steps to scan; the environment's own limit or more.
+
+    Returns:
+        (final states, success ``[n]``, terminated ``[n]``).
+    """
+
+    def one(key: Array) -> tuple[Any, Array, Array]:
+        state, obs = env.reset(key)
+        no = jnp.zeros((), bool)
+
+        def body(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
+            state, obs, success, terminated, over = carry
+            made = env.step(state, act(config, env, params, obs))
+            state, obs = jax.tree.map(
+                lambda a, b: jnp.where(over, a, b), (state, obs), (made.state, made.obs)
+            )
+            success = success | (made.success & ~over)
+            terminated = terminated | (made.terminated & ~over)
+            return (state, obs, success, terminated, over | made.terminated | made.truncated), None
+
+        carry, _ = jax.lax.scan(body, (state, obs, no, no, no), None, max_steps)
+        return carry[0], carry[2], carry[3]
+
+    return jax.vmap(one)(keys)

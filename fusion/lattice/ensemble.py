@@ -11,6 +11,7 @@ import numpy as np
 from jaxtyping import Array, Float, Key
 
 from fusion.lattice import grid
+from fusion.lattice.inputs import require_width
 from fusion.lattice.projections import MARGIN, tilt
 from fusion.lattice.shapes import project_vertices, violation
 
@@ -152,6 +153,7 @@ def apply(
     Returns:
         One number for each example.
     """
+    require_width(x, config.n_inputs, "ensemble.apply")
     chosen = x[..., np.asarray(config.features)]
     lattice = config.lattice
     each = jax.vmap(lambda p, z: grid.apply(p, lattice, z), (0, -2), -1)

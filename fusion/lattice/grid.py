@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from fusion.lattice.inputs import require_width
 from fusion.lattice.projections import MARGIN, tilt
 from fusion.lattice.shapes import project_vertices, violation
 
@@ -172,6 +173,9 @@ def apply(
     Returns:
         The output, without the last axis of `x`.
 
+    Raises:
+        ValueError: the last axis of `x` is not the number of inputs.
+
     Source: Gupta et al. (2016), Monotonic calibrated interpolated look-up tables, sections 2-3.
 
     Example:
@@ -180,6 +184,7 @@ def apply(
         >>> float(apply(params, config, jnp.array([0.5, 0.5])))
         1.5
     """
+    require_width(x, config.rank, "grid.apply")
     if config.interpolation == "simplex":
         return _simplex(params.vertices, config, x)
     return _hypercube(params.vertices, config, x)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from fusion.lattice.inputs import require_width
 from fusion.lattice.projections import (
     MARGIN,
     dykstra,
@@ -170,7 +171,11 @@ def apply(
 
     Returns:
         The outputs.
+
+    Raises:
+        ValueError: the last axis of `x` is not `n_inputs`.
     """
+    require_width(x, config.n_inputs, "linear.apply")
     weights = params.weights
     if config.connected is not None:
         weights = jnp.where(config.links, weights, 0.0)

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from fusion.lattice.inputs import require_width
 from fusion.lattice.projections import MARGIN, isotonic, tilt
 
 __all__ = ["PWLConfig", "PWLParams", "apply", "check", "init", "keypoints", "project"]
@@ -174,8 +175,12 @@ def apply(
     Returns:
         The calibrated inputs.
 
+    Raises:
+        ValueError: the last axis of `x` is not `n_inputs`.
+
     Source: Gupta et al. (2016), Monotonic calibrated interpolated look-up tables, section 3.1.
     """
+    require_width(x, config.n_inputs, "pwl.apply")
     where, outputs = keypoints(params, config)
     lead = (1,) * (x.ndim - 1)
     left = where[:, :-1].reshape(*lead, config.n_inputs, -1)

@@ -53,7 +53,7 @@ class EncoderConfig:
     spectral: bool = True
     frequencies: int = 8
     levels: tuple[tuple[float, ...], ...] = ()
-    backend: Backend = "matmul"
+    backend: Backend | str = "matmul"
 
     def __post_init__(self) -> None:
         """Refuse sizes that cannot be built."""
@@ -70,7 +70,7 @@ def conv1d(
     bias: Float[Array, "k f"],
     *,
     stride: int = 1,
-    backend: Backend = "matmul",
+    backend: Backend | str = "matmul",
 ) -> Float[Array, "k b t2 f"]:
     r"""K independent one-dimensional convolutions, without padding.
 

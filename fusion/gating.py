@@ -26,7 +26,7 @@ __all__ = [
 Normalizer = Literal["softmax", "softmax_sigmoid"]
 
 
-def normalize(scores: Float[Array, "*b k"], normalizer: Normalizer) -> Float[Array, "*b k"]:
+def normalize(scores: Float[Array, "*b k"], normalizer: Normalizer | str) -> Float[Array, "*b k"]:
     r"""Turn K scores into weights that are positive and sum to one.
 
     .. math::
@@ -94,8 +94,10 @@ def apply_weights(
         h = \big\Vert_k K w_k z_k \quad (\text{concat}) \qquad
         h = \textstyle\sum_k w_k z_k \quad (\text{sum})
 
-    The factor K makes equal weights the identity, so that a gated network and the baseline start
-    from the same function.
+    The factor K (``scale="mean"``) makes equal weights the identity, so that a gated network and
+    the baseline start from the same function. ``scale="max"`` divides by the largest weight
+    instead: healthy sensors then pass unchanged however many have failed, but a gate without
+    auxiliary paths trains badly (it can shut informative sensors off early).
     """
     k, b, _ = features.shape
     if scale == "max":
@@ -126,8 +128,9 @@ def drop_modalities(
     keep = jax.random.uniform(draw_key, (k, b)) >= rate
     spare = jax.nn.one_hot(jax.random.randint(spare_key, (b,), 0, k), k, axis=0, dtype=bool)
     keep = jnp.where(jnp.any(keep, axis=0, keepdims=True), keep, spare)
-    scale = k / jnp.sum(keep, axis=0, keepdims=True)
-    return features * (keep * scale)[:, :, None]
+    kept = keep.astype(features.dtype)
+    scale = k / jnp.sum(kept, axis=0, keepdims=True)
+    return features * (kept * scale)[:, :, None]
 
 
 def embrace(

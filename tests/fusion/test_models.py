@@ -1,0 +1,120 @@
+"""Models: matched sizes, ablations, what inference needs, and that it needs nothing else."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import chex
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fusion.encoders import EncoderConfig
+from fusion.models import (
+    MODELS,
+    ModelConfig,
+    auxiliary_logits,
+    count_parameters,
+    export,
+    init,
+    loss_config,
+    match_parameters,
+    predict,
+)
+
+SMALL = ModelConfig(
+    n_sensors=3,
+    n_times=1,
+    n_classes=4,
+    encoder=EncoderConfig(features=8, frequencies=4),
+    gate_width=8,
+    head_widths=(24,),
+)
+X = jax.random.uniform(jax.random.key(9), (7, 3, 1), minval=-1.0)
+FAILED = jnp.zeros((7, 3), bool).at[:, 0].set(True)
+
+
+@pytest.mark.parametrize(
+    "reference",
+    [
+        SMALL,
+        ModelConfig(),
+        ModelConfig(n_sensors=15, n_times=1, n_classes=10, head_widths=(128, 128)),
+    ],
+)
+def test_all_models_match_within_two_percent(reference: ModelConfig) -> None:
+    wanted = count_parameters(reference)["total"]
+    for name in MODELS:
+        matched = match_parameters(dataclasses.replace(reference, model=name), reference)
+        assert abs(count_parameters(matched)["total"] - wanted) <= 0.02 * wanted, name
+
+
+def test_matching_says_when_it_cannot() -> None:
+    huge = dataclasses.replace(SMALL, model="baseline", encoder=EncoderConfig(features=200))
+    with pytest.raises(ValueError, match="not within 2 %"):
+        match_parameters(huge, SMALL)
+
+
+@pytest.mark.parametrize("name", MODELS)
+def test_export_gives_the_same_logits_to_the_bit(name: str) -> None:
+    chex.clear_trace_counter()
+    config = dataclasses.replace(SMALL, model=name)
+    params = init(jax.random.key(0), config)
+    recipe = MODELS[name]
+    assert set(params) == {"main"} | ({"aux"} if recipe.auxiliary else set()) | (
+        {"targets"} if recipe.learned_targets else set()
+    )
+
+    @jax.jit
+    @chex.assert_max_traces(n=1)
+    def in_training(params: dict) -> jax.Array:
+        out = predict(params["main"], config, X, FAILED)
+        if recipe.auxiliary:
+            assert auxiliary_logits(params, config, X, out.features).shape == (7, 3, 4)
+        return out.logits
+
+    main = export(params)
+    names = {jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(main)}
+    assert not any("aux" in n or "lattice" in n for n in names)
+    exported = jax.jit(lambda main: predict(main, config, X, FAILED).logits)(main)
+    np.testing.assert_array_equal(exported, in_training(params))
+
+
+def test_without_weight_sharing_the_auxiliary_paths_have_encoders_of_their_own() -> None:
+    config = dataclasses.replace(SMALL, model="argate_ws", weight_sharing=False)
+    params = init(jax.random.key(0), config)
+    shared = dataclasses.replace(config, weight_sharing=True)
+    assert "encoder" in params["aux"]
+    assert count_parameters(config)["aux"] > count_parameters(shared)["aux"]
+    features = predict(export(params), config, X).features
+    moved = jax.tree.map(lambda p: p + 1.0, params["main"])
+    unchanged = auxiliary_logits(params | {"main": moved}, config, X, features)
+    np.testing.assert_array_equal(auxiliary_logits(params, config, X, features), unchanged)
+
+
+def test_ablations_reach_the_loss() -> None:
+    config = dataclasses.replace(SMALL, model="argate_l", learned_targets=False)
+    assert "targets" not in init(jax.random.key(0), config)
+    assert loss_config(config).regularization and not loss_config(config).learned_targets
+    off = dataclasses.replace(config, regularization=False, loss_weighting=False)
+    assert loss_config(off) == loss_config(dataclasses.replace(SMALL, model="argate_ws"))
+
+
+def test_oracle_needs_the_mask_and_uses_it() -> None:
+    config = dataclasses.replace(SMALL, model="oracle")
+    params = init(jax.random.key(0), config)
+    with pytest.raises(ValueError, match="oracle gate needs `failed`"):
+        predict(export(params), config, X)
+    a = predict(export(params), config, X, FAILED).logits
+    b = predict(export(params), config, X.at[:, 0].set(0.7), FAILED).logits
+    np.testing.assert_array_equal(a, b)
+
+
+def test_bad_configs_name_the_value_and_the_known_ones() -> None:
+    with pytest.raises(ValueError, match="model='argate' is not known; known: baseline, netgated"):
+        ModelConfig(model="argate")
+    with pytest.raises(ValueError, match=r"dropout=1\.0"):
+        ModelConfig(dropout=1.0)
+    with pytest.raises(ValueError, match="n_classes=0"):
+        ModelConfig(n_classes=0)

@@ -1,0 +1,145 @@
+"""Training: learns a problem with a known answer, resumes to the bit, vmaps, stops clearly."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fusion.data import Dataset
+from fusion.data.dataset import Scale
+from fusion.encoders import EncoderConfig
+from fusion.evaluate import gate_auroc, split_accuracy
+from fusion.failures import no_failure, random_failing
+from fusion.fit import Corruption, TrainingDiverged, fit, test_output
+from fusion.losses import LossParams
+from fusion.models import ModelConfig, export
+from fusion.presets import preset
+from fusion.targets import check_targets
+from fusion.train import HyperParams, TrainConfig, evaluate, make_epoch, make_train
+
+# optax's Adam raises a float to an integer power, which strict promotion forbids.
+pytestmark = pytest.mark.relaxed
+
+CHANNELS = ("a", "b", "c", "d")
+MODEL = ModelConfig(
+    model="argate_l",
+    n_sensors=4,
+    n_times=1,
+    n_classes=3,
+    encoder=EncoderConfig(features=8, frequencies=3, levels=((-0.8, 0.0, 0.8),) * 4),
+    gate_width=8,
+    head_widths=(16,),
+    dropout=0.1,
+)
+TRAIN = TrainConfig(epochs=6, batch_size=64, uniform_floor=1.0, label_smoothing=0.0)
+HYPER = HyperParams(1e-2, 1e-4, LossParams(1.0, 3.0, 0.5, 0.3))
+ONE_CLEAN = random_failing(CHANNELS, 1)
+NOISE = Corruption(ONE_CLEAN, ONE_CLEAN)
+
+
+def _dataset(n: int = 2048) -> Dataset:
+    """Four copies of the label: any healthy sensor tells the class, so the best accuracy is 1."""
+    rng = np.random.default_rng(0)
+    y = rng.integers(0, 3, 2 * n).astype(np.int32)
+    x = np.repeat((0.8 * (y - 1.0))[:, None, None], 4, axis=1).astype(np.float32)
+    group = np.zeros(n, np.int32)
+    scale = Scale(-np.ones(4), np.ones(4))
+    return Dataset(
+        "copies", x[:n], y[:n], x[n:], y[n:], group, group, CHANNELS, ("p", "q", "r"), "x", scale
+    )
+
+
+DATA = _dataset()
+
+
+def _same(a: object, b: object) -> None:
+    jax.tree.map(np.testing.assert_array_equal, a, b)
+
+
+@pytest.fixture(scope="module")
+def trained() -> object:
+    return fit(jax.random.key(0), DATA, MODEL, TRAIN, HYPER, NOISE)
+
+
+def test_learns_to_find_the_one_healthy_sensor(trained: object) -> None:
+    output = test_output(jax.random.key(0), trained.state, DATA, MODEL, NOISE)
+    parts = split_accuracy(output.labels, output.logits.argmax(-1), output.failed)
+    assert parts.clean > 0.97
+    assert parts.corrupted > 0.9  # by chance alone one in three
+    assert gate_auroc(output.weights, output.failed) > 0.95
+    assert trained.history[-1]["total"] < trained.history[0]["total"]
+    assert check_targets(trained.state.params["targets"], MODEL.targets) == 0
+
+
+def test_resume_gives_the_same_bits(trained: object, tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    def kill(epoch: int, row: dict[str, float]) -> None:
+        if epoch == 2:
+            raise Killed
+
+    arguments = (jax.random.key(0), DATA, MODEL, TRAIN, HYPER, NOISE)
+    with pytest.raises(Killed):
+        fit(*arguments, checkpoint_dir=tmp_path / "c", on_epoch=kill)
+    with pytest.raises(ValueError, match="holds checkpoints of another run"):
+        fit(*arguments, checkpoint_dir=tmp_path / "c")
+    resumed = fit(*arguments, checkpoint_dir=tmp_path / "c", resume=True)
+    _same(resumed.state, trained.state)
+    assert resumed.history == trained.history
+
+
+def test_non_finite_loss_stops_and_keeps_the_last_good_state(tmp_path: Path) -> None:
+    hyper = HYPER._replace(loss=HYPER.loss._replace(alpha=float("nan")))
+    arguments = (jax.random.key(0), DATA, MODEL, TRAIN)
+    with pytest.raises(TrainingDiverged, match=r"epoch 1 is nan.*Lower the learning rate"):
+        fit(*arguments, hyper, NOISE, checkpoint_dir=tmp_path / "c")
+    # No epoch was good, so no checkpoint stands in the way of a better run.
+    fit(*arguments, HYPER, NOISE, checkpoint_dir=tmp_path / "c")
+
+
+def test_whole_run_vmaps_over_seeds_and_hyper_parameters(trained: object) -> None:
+    train = make_train(MODEL, TRAIN, len(DATA.train_x), ONE_CLEAN, "uniform")
+    x, y = jnp.asarray(DATA.train_x), jnp.asarray(DATA.train_y)
+    hyper = jax.tree.map(lambda v: jnp.full(2, v, jnp.float32), HYPER)
+    hyper = hyper._replace(learning_rate=jnp.asarray([1e-2, 1e-3], jnp.float32))
+    keys = jax.vmap(jax.random.key)(jnp.asarray([0, 1]))
+    _, metrics = jax.jit(jax.vmap(train, (0, 0, None, None)))(keys, hyper, x, y)
+    assert metrics.accuracy.shape == (2, TRAIN.epochs)
+    # The first trial is the run of `fit` with the same key and settings.
+    expected = [row["total"] for row in trained.history]
+    np.testing.assert_allclose(metrics.loss.total[0], expected, rtol=2e-3)
+    assert metrics.loss.total[1, 0] > metrics.loss.total[0, 0]
+
+
+def test_evaluation_does_not_depend_on_the_chunk(trained: object) -> None:
+    main, x = export(trained.state.params), jnp.asarray(DATA.test_x[:70])
+    whole = evaluate(main, MODEL, x, batch_size=70)
+    parts = evaluate(main, MODEL, x, batch_size=32)
+    jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole, parts)
+
+
+def test_models_of_a_seed_see_the_same_corruption(trained: object) -> None:
+    key = jax.random.key(5)
+    baseline = dataclasses.replace(MODEL, model="baseline")
+    other = fit(key, DATA, baseline, dataclasses.replace(TRAIN, epochs=1), HYPER, NOISE)
+    a = test_output(key, trained.state, DATA, MODEL, NOISE)
+    b = test_output(key, other.state, DATA, baseline, NOISE)
+    np.testing.assert_array_equal(a.failed, b.failed)
+
+
+def test_bad_sizes_are_refused_before_any_compile() -> None:
+    with pytest.raises(ValueError, match="10 training examples fill no batch of 64"):
+        make_epoch(MODEL, TRAIN, 10)
+    with pytest.raises(ValueError, match="epochs=0"):
+        TrainConfig(epochs=0)
+    wrong = dataclasses.replace(MODEL, n_sensors=5)
+    with pytest.raises(ValueError, match="build the ModelConfig from the data set"):
+        fit(jax.random.key(0), DATA, wrong, TRAIN, HYPER, Corruption(*[no_failure(CHANNELS)] * 2))
+    with pytest.raises(ValueError, match="no preset for the data set 'copies'"):
+        preset(DATA)

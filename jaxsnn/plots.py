@@ -263,7 +263,7 @@ def spike_raster(
     figure = Figure(figsize=(10.0 if weights else 6.5, 6.0), layout="constrained")
     parts: Any = figure.subfigures(1, 2, width_ratios=[3, 2]) if weights else [figure]
     left, right = parts[0], parts[-1]
-    heights = [max(1.0, np.sqrt(s.shape[1])) for s in spikes.values()]
+    heights = [max(3.0, np.sqrt(s.shape[1])) for s in spikes.values()]
     rows = left.subplots(len(spikes), 1, sharex=True, height_ratios=heights, squeeze=False)[:, 0]
     for ax, (name, fired) in zip(rows, spikes.items(), strict=True):
         fired = np.asarray(fired)

@@ -39,6 +39,7 @@ __all__ = [
     "Surrogate",
     "ask",
     "best_so_far",
+    "describe",
     "first_hit",
     "init",
     "tell",
@@ -77,6 +78,8 @@ class SearchConfig:
 
     ``refit_every`` counts evaluations between fits of the hyper-parameters once there are more
     than ``2 n_init`` of them; in between points are appended to the factorisation.
+    ``retrain_every`` counts evaluations between trainings of a Rev-ARGate (0: once, on the initial
+    ones); all of them count towards the budget. ``rev_argate`` is its RevArgateConfig, or None.
     """
 
     task: Task
@@ -85,13 +88,14 @@ class SearchConfig:
     n_init: int = 50
     n_total: int = 300
     embedding_dim: int | None = None
-    retrain_every: int = 0
+    retrain_every: int = 50
     refit_every: int = 2
     gp: gp.GPConfig = field(default_factory=gp.GPConfig)
     acquisition: acquisition.AcquisitionConfig = field(
         default_factory=acquisition.AcquisitionConfig
     )
     turbo: turbo.TurboConfig = field(default_factory=turbo.TurboConfig)
+    rev_argate: Any = None
 
     def __post_init__(self) -> None:
         """Refuse unknown methods and impossible budgets; complete the method's choices."""
@@ -183,37 +187,40 @@ def _keys(config: SearchConfig, n: int) -> Any:
     return jnp.stack(keys)
 
 
-@lru_cache(maxsize=64)
-def _programs(config: SearchConfig) -> dict[str, Any]:
-    """The jitted programs of a search, each mapped over the seeds; shapes are bound at call."""
+@lru_cache(maxsize=16)
+def _programs(
+    gp_config: gp.GPConfig, acq: acquisition.AcquisitionConfig
+) -> dict[str, Callable[..., Any]]:
+    """The jitted programs of the surrogate, mapped over seeds; methods and tasks share them."""
 
     def mapped(f: Callable[..., Any]) -> Any:
         return jax.jit(lambda *args: jax.lax.map(lambda a: f(*a), args))
 
     def fit(x: Any, y: Any, n: Any, params: Any, h: Any, fresh: Any) -> Any:
-        return gp_fit.fit(config.gp, x, y, n, params, h, fresh)
+        return gp_fit.fit(gp_config, x, y, n, params, h, fresh)
 
     def raw(domain: Domain, centres: Any, key: Any) -> Any:
-        return acquisition.raw_points(domain, centres, key, config.acquisition.n_raw)
-
-    def decode_block(space: Space, u: Any) -> Any:
-        return jax.vmap(partial(decode, space, task_domain(config.task)))(u)
+        return acquisition.raw_points(domain, centres, key, acq.n_raw)
 
     return {
         "fit": mapped(fit),
-        "condition": mapped(partial(gp.condition, config.gp)),
-        "append": mapped(partial(gp.append, config.gp)),
+        "condition": mapped(partial(gp.condition, gp_config)),
+        "append": mapped(partial(gp.append, gp_config)),
         "raw": mapped(raw),
-        "propose": mapped(partial(acquisition.propose, config.gp, config.acquisition)),
-        "decode": jax.jit(jax.vmap(decode_block)),
-        "encode": jax.jit(jax.vmap(lambda space, x: jax.vmap(partial(encode, space))(x))),
+        "propose": mapped(partial(acquisition.propose, gp_config, acq)),
         "region": jax.jit(jax.vmap(turbo.trust_region)),
     }
 
 
-def _program_key(config: SearchConfig) -> SearchConfig:
-    """Programs depend neither on the seeds nor on the budget, so runs share them."""
-    return replace(config, seeds=(0,), n_init=2, n_total=2, refit_every=1)
+@jax.jit
+def _decode(space: Any, domain: Domain, u: Any) -> Any:
+    """``u [S, q, d]`` to ``(x [S, q, D], clipped [S, q])``."""
+    return jax.vmap(lambda s, block: jax.vmap(partial(decode, s, domain))(block))(space, u)
+
+
+@jax.jit
+def _encode(space: Any, x: Any) -> Any:
+    return jax.vmap(lambda s, block: jax.vmap(partial(encode, s))(block))(space, x)
 
 
 def _stack(tree: Any, count: int) -> Any:
@@ -243,7 +250,7 @@ def _initial(config: SearchConfig, state: SearchState) -> SearchState:
         drawn_from = _stack(FullSpace(jnp.asarray(unit_scale(config.task))), len(config.seeds))
     one = jax.tree.map(lambda leaf: leaf[0], drawn_from)
     u = jax.vmap(lambda key: initial_design(one, config.task, key, config.n_init))(keys)
-    x, clipped = _programs(_program_key(config))["decode"](drawn_from, u)
+    x, clipped = _decode(drawn_from, task_domain(config.task), u)
     pending = (np.asarray(x), np.asarray(u), np.asarray(clipped))
     return state._replace(pending=pending, space=space)
 
@@ -289,7 +296,7 @@ def _targets(state: SearchState, size: int) -> tuple[np.ndarray, np.ndarray]:
 
 def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
     """Fit hyper-parameters: from the last ones where there are any, else from the priors' mode."""
-    fit = _programs(_program_key(config))["fit"]
+    fit = _programs(config.gp, config.acquisition)["fit"]
     seeds, dim = len(config.seeds), x.shape[2]
     count = jnp.full((seeds,), state.n, jnp.int32)
     old = state.surrogate
@@ -317,7 +324,7 @@ def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
 
 def _surrogate_ask(config: SearchConfig, state: SearchState) -> SearchState:
     """Fit or append, then maximise the acquisition for all seeds."""
-    programs = _programs(_program_key(config))
+    programs = _programs(config.gp, config.acquisition)
     n, s = state.n, len(config.seeds)
     q = config.acquisition.batch_size
     size = gp.padded_size(n)
@@ -353,7 +360,7 @@ def _surrogate_ask(config: SearchConfig, state: SearchState) -> SearchState:
     raw = programs["raw"](domain, centres, _keys(config, n))
     u, _ = programs["propose"](posterior, domain, best, raw)
     u = u[:, : config.n_total - n]
-    new_x, clipped = programs["decode"](state.space, u)
+    new_x, clipped = _decode(state.space, task_domain(config.task), u)
     pending = (np.asarray(new_x), np.asarray(u), np.asarray(clipped))
     return state._replace(pending=pending, surrogate=surrogate, posterior=posterior)
 
@@ -371,10 +378,33 @@ def _learn_space(config: SearchConfig, state: SearchState, train: TrainSpace | N
         train = train_space
     keys = _keys(config, state.n)
     space = train(config, keys, state.x, state.y)
-    u = _programs(_program_key(config))["encode"](space, jnp.asarray(state.x))
+    u = _encode(space, jnp.asarray(state.x))
     return state._replace(
         space=space, space_at=state.n, u=np.asarray(u), surrogate=None, posterior=None
     )
+
+
+def describe(
+    config: SearchConfig, state: SearchState, asked: list[Any] | None = None
+) -> SearchState:
+    """Give a history of ``x`` and ``y`` its coordinates in the search space.
+
+    Args:
+        config: the search.
+        state: with ``x``; ``space`` is made where it needs no data.
+        asked: unit coordinates of the evaluations after ``space_at``, in blocks ``[S, q, d]``;
+            what was not asked in this space is encoded from ``x``.
+    """
+    with jax.enable_x64(True):
+        space = state.space if state.space is not None else _first_space(config)
+        if space is None:
+            return state
+        parts = [np.asarray(block, np.float64) for block in asked or []]
+        known = sum(part.shape[1] for part in parts)
+        if known < state.n:
+            head = _encode(space, jnp.asarray(state.x[:, : state.n - known]))
+            parts.insert(0, np.asarray(head))
+    return state._replace(space=space, u=np.concatenate(parts, 1))
 
 
 def ask(

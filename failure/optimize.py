@@ -53,7 +53,7 @@ def box(lower: Float[Array, " d"], upper: Float[Array, " d"]) -> Domain:
 
 def ball(dim: int, radius: float) -> Domain:
     """A ball around the origin."""
-    limit = jnp.full((dim,), radius)
+    limit = jnp.full((dim,), jnp.inf)
     return Domain(-limit, limit, jnp.asarray(radius, limit.dtype))
 
 
@@ -119,7 +119,8 @@ def bfgs(
         x0: start, inside the domain.
         domain: the feasible set.
         max_evals: evaluations at most, the one at ``x0`` included.
-        hessian_inverse: ``H`` of an earlier call, to go on from; the identity without.
+        hessian_inverse: ``H`` of an earlier call, to go on from, or (with ``fresh``) a metric that
+            makes the coordinates comparable; the identity without.
         fresh: whether to rescale ``H`` at the first step; true without ``hessian_inverse``. Traced,
             so that cold and warm starts are one program.
         max_move: longest step per coordinate.
@@ -134,7 +135,7 @@ def bfgs(
     :math:`s^\top y \le 10^{-10} |s||y|` are skipped instead.
     """
     dim = x0.shape[0]
-    eye = jnp.eye(dim, dtype=x0.dtype)
+    metric = jnp.eye(dim, dtype=x0.dtype) if hessian_inverse is None else hessian_inverse
     zero, one = jnp.zeros((), x0.dtype), jnp.ones((), x0.dtype)
 
     def aim(x: Array, grad: Array, h: Array) -> tuple[Array, Array]:
@@ -154,7 +155,7 @@ def bfgs(
         x=x0,
         value=jnp.full((), jnp.inf, x0.dtype),
         grad=jnp.zeros_like(x0),
-        h=eye if hessian_inverse is None else hessian_inverse,
+        h=metric,
         fresh=jnp.asarray(hessian_inverse is None) if fresh is None else fresh,
         direction=jnp.zeros_like(x0),
         step=one,
@@ -177,8 +178,8 @@ def bfgs(
             curvature > 1e-10 * jnp.linalg.norm(move) * jnp.linalg.norm(change) + 1e-300**0.5
         )
         rho = jnp.where(pair, 1.0 / jnp.where(pair, curvature, one), zero)
-        first = curvature / jnp.maximum(change @ change, 1e-30)
-        h0 = jnp.where(s.fresh & pair, first * eye, s.h)
+        first = curvature / jnp.maximum(change @ (metric @ change), 1e-30)
+        h0 = jnp.where(s.fresh & pair, first * metric, s.h)
         h_change = h0 @ change
         outer = move[:, None] * h_change[None, :]
         h_new = (
@@ -195,7 +196,7 @@ def bfgs(
         # A refused step of negligible length: forget the curvature once, then give up.
         tiny = ~accept & (s.step < 1e-6)
         restart = tiny | (s.fresh & ~pair)
-        h_next = jnp.where(restart, eye / jnp.maximum(grad_norm, 1.0), h_new)
+        h_next = jnp.where(restart, metric / jnp.maximum(grad_norm, 1.0), h_new)
         x = jnp.where(accept, x_new, s.x)
         grad = jnp.where(accept, grad_new, s.grad)
         renew = accept | tiny

@@ -4,12 +4,12 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from failure.circuits.ldo import ldo
+from failure.circuits.ldo import make_ldo
 from failure.circuits.protocol import Circuit, Spec
 
-__all__ = ["CIRCUITS", "Circuit", "Spec", "get", "ldo"]
+__all__ = ["CIRCUITS", "Circuit", "Spec", "get", "make_ldo"]
 
-CIRCUITS: dict[str, Callable[[], Circuit]] = {"ldo": ldo}
+CIRCUITS: dict[str, Callable[[], Circuit]] = {"ldo": make_ldo}
 """Name -> function that makes the circuit."""
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from functools import lru_cache, partial
 from typing import NamedTuple
 
@@ -10,13 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from failure.circuits.mna import (
-    System,
-    Values,
-    compile_netlist,
-    nominal_values,
-    source_current,
-)
+from failure.circuits.mna import Values, nominal_values, source_current
 from failure.circuits.mosfet import NMOS, PMOS, mos_params
 from failure.circuits.netlist import (
     Capacitor,
@@ -29,15 +24,16 @@ from failure.circuits.netlist import (
 )
 from failure.circuits.protocol import Circuit, Spec, in_chunks
 from failure.circuits.solve import Grid, dc, grid, transient
+from failure.circuits.system import System, compile_netlist
 
-__all__ = ["I_HEAVY", "I_LIGHT", "NETLIST", "QUANTITIES", "SPECS", "TIME", "ldo", "solve_ldo"]
+__all__ = ["I_HEAVY", "I_LIGHT", "NETLIST", "QUANTITIES", "SPECS", "TIME", "make_ldo", "solve_ldo"]
 
-I_LIGHT = 1e-3
-I_HEAVY = 150e-3
-"""Load before and after the step [A]."""
+KNEE = 1.0
+"""Voltage scale of the load [V]: it draws `amps * tanh(v / KNEE)`, less as the output falls."""
 
-KNEE = 0.5
-"""Output voltage [V] below which the load lets go."""
+I_LIGHT = 1e-3 / math.tanh(1.0 / KNEE)
+I_HEAVY = 150e-3 / math.tanh(1.0 / KNEE)
+"""Load before and after the step [A]: 1 mA and 150 mA at 1 V."""
 
 T_STEP, T_RISE, T_END = 10e-9, 1e-9, 120e-9
 """Start and length of the load step, end of the transient [s]."""
@@ -88,7 +84,7 @@ NETLIST = Netlist(
         # Follower buffer, its current sensed by M13 and turned into a pull-down at the output.
         _p("M11", "x", "ga", "gp", 1500, 0.35),
         _n("M13", "x", "x", "0", 200, 0.5),
-        _p("MP", "out", "gp", "vin", 5000, 0.35),
+        _p("MP", "out", "gp", "vin", 6000, 0.35),
         Capacitor("Cout", "out", "oesr", 0.4e-9),
         Resistor("Resr", "oesr", "0", 0.1),
         Load("Bload", "out", "0", I_LIGHT, KNEE),
@@ -96,11 +92,12 @@ NETLIST = Netlist(
 )
 
 TIME: Grid = grid(
-    (0.0, T_STEP, 2, 1.0),
-    (T_STEP, T_STEP + T_RISE, 12, 1.0),
-    (T_STEP + T_RISE, T_END, 88, 60.0),
+    (0.0, T_STEP, 1, 1.0),
+    (T_STEP, T_STEP + T_RISE, 8, 1.0),
+    (T_STEP + T_RISE, 14e-9, 24, 2.0),
+    (14e-9, T_END, 20, 20.0),
 )
-"""Grid of the transient: finest in the load step and just after it."""
+"""Grid of the transient: finest in the load step and in the dip after it."""
 
 
 class _Setup(NamedTuple):
@@ -211,7 +208,7 @@ def _run(x: Float[Array, "n d"], *, model: str) -> tuple[Array, Array]:
 
 
 @lru_cache(maxsize=4)
-def ldo(model: str = "ekv") -> Circuit:
+def make_ldo(model: str = "ekv") -> Circuit:
     """The LDO regulator: 60 parameters, quiescent current, undershoot and load regulation.
 
     Args:

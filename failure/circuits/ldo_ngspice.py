@@ -18,8 +18,8 @@ from failure.circuits.ldo import (
     T_STEP,
     variation,
 )
-from failure.circuits.mna import compile_netlist
 from failure.circuits.netlist import Mosfet
+from failure.circuits.system import compile_netlist
 
 __all__ = ["ldo_decks", "ldo_reference"]
 

@@ -1,7 +1,6 @@
-"""Modified nodal analysis: from a netlist to a batched residual and its sparse Jacobian.
+"""Modified nodal analysis: the batched residual of a compiled netlist and its sparse Jacobian.
 
-Unknowns are the node voltages that no grounded voltage source fixes, then the branch currents of
-inductors and floating voltage sources. The batch is the last axis of every array. The Jacobian is
+The batch is the last axis of every array. The Jacobian is
 a dictionary of its structurally nonzero entries, each `[batch]`; elimination runs without pivoting
 in minimum-degree order and is unrolled when it is traced, so that XLA sees straight-line code.
 """
@@ -9,14 +8,13 @@ in minimum-degree order and is unrolled when it is traced, so that XLA sees stra
 from __future__ import annotations
 
 from collections.abc import Mapping
-from dataclasses import dataclass
 from typing import NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from failure.circuits.mosfet import MODELS, MosParams, drain_current, mos_params
+from failure.circuits.mosfet import MosParams, drain_current, mos_params
 from failure.circuits.netlist import (
     GROUND,
     Capacitor,
@@ -24,18 +22,16 @@ from failure.circuits.netlist import (
     Inductor,
     Load,
     Mosfet,
-    Netlist,
     Resistor,
     Switch,
     VoltageSource,
 )
+from failure.circuits.system import System, branches, pattern
 
 __all__ = [
     "GMIN",
     "Stamps",
-    "System",
     "Values",
-    "compile_netlist",
     "eliminate",
     "nominal_values",
     "residual",
@@ -60,126 +56,6 @@ class Values(NamedTuple):
     amps: Float[Array, "i b"]
     load: Float[Array, "o b"]
     control: Float[Array, "s b"]
-
-
-@dataclass(frozen=True, eq=False)
-class System:
-    """A compiled netlist: index maps only, no numbers of a sample."""
-
-    netlist: Netlist
-    model: str
-    unknowns: tuple[str, ...]
-    """Node names, then `element#branch` for the branch currents."""
-    known: tuple[str, ...]
-    """Fixed nodes (grounded sources), then ground."""
-    order: tuple[int, ...]
-    """Elimination order of the unknowns."""
-    fixed_by: Mapping[str, int]
-    """Fixed node -> index of its voltage source."""
-
-    @property
-    def n(self) -> int:
-        """Number of unknowns."""
-        return len(self.unknowns)
-
-    def index(self, node: str) -> int:
-        """Position of a node in the vector `[unknowns, known]`.
-
-        Raises:
-            ValueError: no such node.
-        """
-        names = (*self.unknowns, *self.known)
-        if node not in names:
-            raise ValueError(f"no node {node!r} in {self.netlist.title}; known: {', '.join(names)}")
-        return names.index(node)
-
-
-def compile_netlist(netlist: Netlist, model: str = "ekv") -> System:
-    """Number the unknowns of a netlist and choose the elimination order.
-
-    Args:
-        netlist: the circuit.
-        model: MOSFET model, "ekv" or "level1".
-    Returns:
-        System.
-    Raises:
-        ValueError: unknown model, two grounded sources on one node, or a node whose only
-            connections are inductors, floating sources or gates, so that nothing pins it at DC.
-    """
-    if model not in MODELS:
-        raise ValueError(f"unknown MOSFET model {model!r}; known: {', '.join(MODELS)}")
-    fixed: dict[str, int] = {}
-    branches = [f"{e.name}#branch" for e in netlist.of(Inductor)]
-    for k, source in enumerate(netlist.of(VoltageSource)):
-        if source.n == GROUND:
-            if source.p in fixed:
-                raise ValueError(f"{netlist.title}: two voltage sources fix node {source.p!r}")
-            fixed[source.p] = k
-        else:
-            branches.append(f"{source.name}#branch")
-    free = [n for n in netlist.nodes() if n != GROUND and n not in fixed]
-    system = System(netlist, model, (*free, *branches), (*fixed, GROUND), (), fixed)
-    return System(netlist, model, system.unknowns, system.known, _order(system), fixed)
-
-
-def _order(system: System) -> tuple[int, ...]:
-    """Minimum-degree order in which every pivot is structurally nonzero."""
-    graph: dict[int, set[int]] = {i: set() for i in range(system.n)}
-    grounded = set()
-    for (i, j), dc in _pattern(system).items():
-        if i == j:
-            if dc:
-                grounded.add(i)
-        elif j < system.n:
-            graph[i].add(j)
-            graph[j].add(i)
-    order: list[int] = []
-    while graph:
-        ready = [i for i in graph if i in grounded]
-        if not ready:
-            names = ", ".join(system.unknowns[i] for i in graph)
-            raise ValueError(
-                f"{system.netlist.title}: nothing but inductors, capacitors, gates or floating "
-                f"sources holds {names}; add a resistance"
-            )
-        pivot = min(ready, key=lambda i: (len(graph[i]), i))
-        near = graph.pop(pivot)
-        for i in near:
-            graph[i] |= near - {i}
-            graph[i].discard(pivot)
-        # A branch row has no diagonal of its own; eliminating one of its nodes gives it one.
-        grounded |= near
-        order.append(pivot)
-    return tuple(order)
-
-
-def _pattern(system: System) -> dict[tuple[int, int], bool]:
-    """Structural nonzeros -> whether the entry is nonzero at DC by more than gmin."""
-    pattern: dict[tuple[int, int], bool] = {}
-
-    def put(row: str, column: str, dc: bool) -> None:
-        i, j = system.index(row), system.index(column)
-        if i < system.n:
-            pattern[i, j] = pattern.get((i, j), False) or dc
-
-    for e in system.netlist.elements:
-        if isinstance(e, Mosfet):
-            for row in (e.drain, e.source):
-                put(row, e.drain, row == e.drain)
-                put(row, e.source, row == e.source)
-                put(row, e.gate, False)
-                put(e.gate, row, False)  # gate capacitances
-            put(e.gate, e.gate, False)
-        elif isinstance(e, Resistor | Switch | Load | Capacitor):
-            for row in (e.p, e.n):
-                for column in (e.p, e.n):
-                    put(row, column, not isinstance(e, Capacitor))
-        branch = f"{e.name}#branch"
-        if branch in system.unknowns:
-            for node in (e.p, e.n):
-                put(node, branch, False)
-                put(branch, node, False)
-    return pattern
 
 
 def nominal_values(system: System) -> Values:
@@ -261,39 +137,35 @@ def conductance(system: System, values: Values) -> tuple[Entries, dict[int, Arra
     """Linear conductances and branch equations, and the constant term of each row."""
     entries: Entries = {}
     const: dict[int, Array] = {}
-    n_nodes = len([u for u in system.unknowns if "#" not in u])
-    for i in range(n_nodes):
-        _add(entries, i, i, jnp.full_like(values.mos.beta[0], GMIN))
+    one = jnp.ones((batch_size(values),), values.volts.dtype)
+    for i in range(system.n_nodes):
+        _add(entries, i, i, GMIN * one)
     for k, r in enumerate(system.netlist.of(Resistor)):
         _pair(entries, system, r.p, r.n, 1.0 / values.ohms[k])
     for k, s in enumerate(system.netlist.of(Switch)):
-        on, off = np.log(1.0 / s.ohms_on), np.log(1.0 / s.ohms_off)
+        on, off = float(np.log(1.0 / s.ohms_on)), float(np.log(1.0 / s.ohms_off))
         _pair(entries, system, s.p, s.n, jnp.exp(off + (on - off) * values.control[k]))
     for k, c in enumerate(system.netlist.of(CurrentSource)):
         for node, sign in ((c.p, 1.0), (c.n, -1.0)):
             i = system.index(node)
             if i < system.n:
-                const[i] = const.get(i, 0.0) + sign * values.amps[k]
-    one = jnp.ones_like(values.mos.beta[0])
-    sources = [(k, v) for k, v in enumerate(system.netlist.of(VoltageSource))]
-    for k, b in [(None, e) for e in system.netlist.of(Inductor)] + sources:
-        name = f"{b.name}#branch"
-        if name not in system.unknowns:
-            continue
-        row = system.index(name)
+                const[i] = const.get(i, 0.0 * one) + sign * values.amps[k]
+    sources = system.netlist.of(VoltageSource)
+    for b in branches(system.netlist):
+        row = system.index(f"{b.name}#branch")
         for node, sign in ((b.p, 1.0), (b.n, -1.0)):
             i = system.index(node)
             if i < system.n:
                 _add(entries, i, row, sign * one)
             _add(entries, row, i, sign * one)
-        if k is not None:
-            const[row] = -values.volts[k]
+        if isinstance(b, VoltageSource):
+            const[row] = -values.volts[sources.index(b)]
     return entries, const
 
 
 def keys(system: System) -> list[tuple[int, int]]:
     """Order in which `Stamps.linear` lists the entries among unknowns."""
-    found = {k for k in _pattern(system) if k[1] < system.n}
+    found = {k for k in pattern(system) if k[1] < system.n}
     found |= {(i, i) for i in range(system.n)}
     return sorted(found)
 
@@ -447,10 +319,9 @@ def source_current(
         total = total + ((r.p == node) - (r.n == node)) * drop / values.ohms[k]
     for k, c in enumerate(system.netlist.of(CurrentSource)):
         total = total + ((c.p == node) - (c.n == node)) * values.amps[k]
-    for b in system.netlist.elements:
-        branch = f"{b.name}#branch"
-        if branch in system.unknowns:
-            total = total + ((b.p == node) - (b.n == node)) * full[system.index(branch)]
+    for b in branches(system.netlist):
+        sign = (b.p == node) - (b.n == node)
+        total = total + sign * full[system.index(f"{b.name}#branch")]
     for k, load in enumerate(system.netlist.of(Load)):
         drop = full[system.index(load.p)] - full[system.index(load.n)]
         sign = (load.p == node) - (load.n == node)

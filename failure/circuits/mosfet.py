@@ -18,6 +18,9 @@ __all__ = [
     "MODELS",
     "NMOS",
     "PMOS",
+    "SLOPE",
+    "SMOOTH_VDS",
+    "U_T",
     "MosParams",
     "Process",
     "drain_current",
@@ -35,7 +38,7 @@ U_T = 0.02585
 SLOPE = 1.3
 """Subthreshold slope factor n of the EKV model."""
 
-_SMOOTH_VDS = 1e-2
+SMOOTH_VDS = 1e-2
 """Width [V] of the smoothed |v_ds| in channel-length modulation."""
 
 
@@ -184,8 +187,8 @@ def ekv(
     slope = (2.0 * scale) * i_s
     df = slope * lf * sf
     dr = slope * lr * sr
-    root = jnp.sqrt(vds * vds + _SMOOTH_VDS**2)
-    clm = 1.0 + params.lam * (root - _SMOOTH_VDS)
+    root = jnp.sqrt(vds * vds + SMOOTH_VDS**2)
+    clm = 1.0 + params.lam * (root - SMOOTH_VDS)
     return (
         core * clm,
         (df - dr) * clm,

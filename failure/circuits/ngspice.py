@@ -19,7 +19,7 @@ from typing import Any
 import numpy as np
 
 from failure.circuits.mna import Values
-from failure.circuits.mosfet import _SMOOTH_VDS, EPS_OX, SLOPE, U_T, MosParams
+from failure.circuits.mosfet import EPS_OX, SLOPE, SMOOTH_VDS, U_T, MosParams
 from failure.circuits.netlist import (
     Capacitor,
     CurrentSource,
@@ -74,13 +74,13 @@ def _ekv_source(m: Mosfet, p: float, beta: float, vto: float, lam: float) -> str
     def softplus(a: str, b: str) -> str:
         return f"ln(1+exp(({sign}(V({a})-V({b}))-({vto!r}))*{scale!r}))"
 
-    square = _SMOOTH_VDS**2
+    square = SMOOTH_VDS**2
     vds = f"(V({m.drain})-V({m.source}))"
     return (
         f"B{m.name} {m.drain} {m.source} I={sign}({i_s!r})*"
         f"({softplus(m.gate, m.source)}-{softplus(m.gate, m.drain)})*"
         f"({softplus(m.gate, m.source)}+{softplus(m.gate, m.drain)})*"
-        f"(1+({lam!r})*(sqrt({vds}*{vds}+{square!r})-{_SMOOTH_VDS!r}))"
+        f"(1+({lam!r})*(sqrt({vds}*{vds}+{square!r})-{SMOOTH_VDS!r}))"
     )
 
 
@@ -130,18 +130,20 @@ def elements(
             f".model m{m.name} {kind} level=1 vto={p * vto!r} kp={kp!r} lambda={lam!r} "
             f"tox={tox!r} cgso={m.process.overlap!r} cgdo={m.process.overlap!r} gamma=0 phi=0.7"
         )
-    for kind, letter, leaf in (
+    passive: tuple[tuple[type, str, Any], ...] = (
         (Resistor, "R", values.ohms),
         (Capacitor, "C", values.farads),
         (Inductor, "L", values.henries),
-    ):
-        for k, e in enumerate(netlist.of(kind)):
+    )
+    for element, letter, leaf in passive:
+        for k, e in enumerate(netlist.of(element)):
             lines.append(f"{letter}_{e.name} {e.p} {e.n} {at(leaf, k)!r}")
-    for kind, letter, leaf in (
+    sources: tuple[tuple[type, str, Any], ...] = (
         (VoltageSource, "V", values.volts),
         (CurrentSource, "I", values.amps),
-    ):
-        for k, e in enumerate(netlist.of(kind)):
+    )
+    for element, letter, leaf in sources:
+        for k, e in enumerate(netlist.of(element)):
             tail = " " + _pwl(waves[e.name]) if e.name in waves else ""
             lines.append(f"{letter}_{e.name} {e.p} {e.n} DC {at(leaf, k)!r}{tail}")
     for k, e in enumerate(netlist.of(Load)):

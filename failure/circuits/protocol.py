@@ -114,7 +114,7 @@ def in_chunks(
     *,
     chunk: int = CHUNK,
 ) -> tuple[Float[Array, "n m"], Int[Array, "n"]]:
-    """Run a batch-last solver over `x [n, d]` in equal chunks, so that n costs no new shapes inside.
+    """Run a batch-last solver over `x [n, d]` in chunks of one size.
 
     Args:
         solve: `[d, b] -> (specs [m, b], status [b])`.

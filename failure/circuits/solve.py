@@ -12,7 +12,6 @@ from jaxtyping import Array, Float, Int
 
 from failure.circuits.mna import (
     Stamps,
-    System,
     Values,
     assemble,
     batch_size,
@@ -24,7 +23,8 @@ from failure.circuits.mna import (
     residual,
     stamps,
 )
-from failure.circuits.netlist import Capacitor, CurrentSource, Inductor, Load, Switch, VoltageSource
+from failure.circuits.netlist import CurrentSource, Inductor, Load, Switch, VoltageSource
+from failure.circuits.system import System
 
 __all__ = ["CONVERGED", "NOT_CONVERGED", "Grid", "Solution", "dc", "grid", "newton", "transient"]
 
@@ -32,7 +32,10 @@ CONVERGED = 0
 NOT_CONVERGED = 1
 
 V_TOL = 1e-7
-"""A Newton step below this [V] ends the iteration; the error is then its square."""
+"""A Newton step below this [V] ends a DC solve; what is left is its square."""
+
+V_TOL_STEP = 1e-4
+"""The same within a transient step, where it leaves less than 1e-8 V (measured)."""
 
 MAX_STEP = 0.3
 """Largest change of a voltage in one Newton step [V]."""
@@ -49,16 +52,18 @@ class Stages(NamedTuple):
     scale: tuple[float, ...]
     restart: tuple[int, ...]
     end: tuple[bool, ...]
+    tolerance: float
 
 
-PLAIN = Stages((0.0,), (1.0,), (1,), (True,))
-"""Newton alone."""
+PLAIN = Stages((0.0,), (1.0,), (1,), (True,), V_TOL_STEP)
+"""Newton alone, for a time step."""
 
 CONTINUATION = Stages(
     gmin=(0.0, *(10.0**-k for k in range(2, 11)), 0.0, *(0.0,) * 20),
     scale=(1.0, *(1.0,) * 10, *(k / 20 for k in range(1, 21))),
     restart=(1, 1, *(0,) * 9, 2, *(0,) * 19),
     end=(True, *(False,) * 9, True, *(False,) * 19, True),
+    tolerance=V_TOL,
 )
 """Newton, then gmin stepping, then source stepping; ends as soon as all samples are solved."""
 
@@ -85,10 +90,10 @@ def newton(
         v0: start; has no derivative.
         s: Stamps.
     Returns:
-        (unknowns `[n, b]`, size of the last Newton step `[b]` [V]; above `V_TOL` or NaN: not
+        (unknowns `[n, b]`, size of the last Newton step `[b]` [V]; above the tolerance or NaN: not
         converged).
     """
-    nodes = len([u for u in system.unknowns if "#" not in u])
+    nodes = system.n_nodes
 
     def solve(v: Array, s: Stamps) -> tuple[Array, Array]:
         def body(carry: tuple) -> tuple:
@@ -97,13 +102,13 @@ def newton(
             step = eliminate(system, jacobian, f)
             size = jnp.max(jnp.abs(step[:nodes]), axis=0)
             damp = jnp.minimum(1.0, MAX_STEP / jnp.maximum(size, 1e-30))
-            active = ~(last < V_TOL)
+            active = ~(last < stages.tolerance)
             v = v - jnp.where(active[None], damp[None] * step, 0.0)
             return k + 1, v, jnp.where(active, size, last)
 
         def go_on(carry: tuple) -> Array:
             k, _, last = carry
-            return (k < max_iterations) & jnp.any(~(last < V_TOL))
+            return (k < max_iterations) & jnp.any(~(last < stages.tolerance))
 
         start = (jnp.zeros((), jnp.int32), v, jnp.full(v.shape[-1:], jnp.inf, v.dtype))
         _, v, last = jax.lax.while_loop(go_on, body, start)
@@ -128,7 +133,7 @@ def newton(
         start = jnp.where(restarts[k] > 0, restart, v)
         new, last = solve(start, here)
         new = jnp.where(jnp.isfinite(new), new, start)
-        take = ends[k] & ~(best_last < V_TOL)
+        take = ends[k] & ~(best_last < stages.tolerance)
         return (
             k + 1,
             new,
@@ -138,7 +143,7 @@ def newton(
 
     def more(carry: tuple) -> Array:
         k, _, _, best_last = carry
-        return (k < len(stages.gmin)) & jnp.any(~(best_last < V_TOL))
+        return (k < len(stages.gmin)) & jnp.any(~(best_last < stages.tolerance))
 
     unsolved = jnp.full(v0.shape[-1:], jnp.inf, v0.dtype)
     start = (jnp.zeros((), jnp.int32), v0, v0, unsolved)
@@ -188,25 +193,27 @@ def dc(
         Solution; gradients by the implicit function theorem.
     """
     shape = (system.n, batch_size(values))
-    start = jnp.zeros((1, 1), values.mos.beta.dtype) if v0 is None else v0
+    start = jnp.zeros((1, 1), values.volts.dtype) if v0 is None else v0
     start = jax.lax.stop_gradient(jnp.broadcast_to(start, shape))
     v, last = newton(system, max_iterations, CONTINUATION, start, stamps(system, values))
     return Solution(v, _status(last < V_TOL))
 
 
 class Grid(NamedTuple):
-    """Times of a transient [s]; per step whether it is backward Euler and whether a piece begins."""
+    """Times of a transient [s]; per step: backward Euler or not, first of a piece or not."""
 
     t: np.ndarray
     euler: np.ndarray
     begins: np.ndarray
 
 
-def grid(*pieces: tuple[float, float, int, float]) -> Grid:
-    """Join pieces `(t_start, t_end, n_steps, growth)`; each starts with two backward-Euler steps.
+def grid(*pieces: tuple[float, float, int, float], euler_steps: int = 0) -> Grid:
+    """Join pieces `(t_start, t_end, n_steps, growth)` of geometrically growing steps.
 
     Args:
         pieces: `growth` is the ratio of the last to the first step of the piece.
+        euler_steps: backward-Euler steps at the start of each piece; sources that jump there need
+            two, corners of piecewise-linear sources none.
     Returns:
         Grid with `sum(n_steps) + 1` times.
     Raises:
@@ -221,8 +228,8 @@ def grid(*pieces: tuple[float, float, int, float]) -> Grid:
         h = growth ** (np.arange(n) / max(n - 1, 1))
         times.extend(start + (end - start) * np.cumsum(h) / h.sum())
         times[-1] = end
-        euler.extend([True] * min(2, n) + [False] * max(0, n - 2))
-        begins.extend([True] + [False] * (n - 1))
+        euler.extend(k < euler_steps for k in range(n))
+        begins.extend(k == 0 for k in range(n))
     return Grid(np.array(times), np.array(euler), np.array(begins))
 
 
@@ -234,8 +241,8 @@ _KINDS = {
 }
 
 
-def _waves(system: System, values: Values, waveforms: dict[str, Array]) -> Any:
-    """Map element name -> (field, row) of `Values`; checks the names."""
+def _places(system: System, waveforms: dict[str, Array]) -> dict[str, tuple[str, int]]:
+    """Where in `Values` each source is: name -> (field, row)."""
     places = {}
     for kind, attribute in _KINDS.items():
         for row, e in enumerate(system.netlist.of(kind)):
@@ -254,7 +261,7 @@ def transient(
     waveforms: dict[str, Float[Array, "t b"]],
     *,
     probes: tuple[str, ...],
-    max_iterations: int = 12,
+    max_iterations: int = 60,
 ) -> tuple[Float[Array, "p t b"], Solution]:
     r"""Transient from a DC point on a fixed grid.
 
@@ -275,7 +282,7 @@ def transient(
     Raises:
         ValueError: unknown element or node.
     """
-    places = _waves(system, values, waveforms)
+    places = _places(system, waveforms)
     rows = [system.index(p) for p in probes]
     batch = batch_size(values)
     dtype = start.v.dtype
@@ -293,7 +300,8 @@ def transient(
             attribute, row = places[name]
             field = getattr(changed, attribute)
             field = jnp.broadcast_to(field, (field.shape[0], max(field.shape[1], value.shape[0])))
-            changed = changed._replace(**{attribute: field.at[row].set(value)})
+            new: Any = {attribute: field.at[row].set(value)}
+            changed = changed._replace(**new)
         return changed
 
     def charge(full: Array) -> Array:
@@ -327,7 +335,7 @@ def transient(
         new, last = newton(system, max_iterations, PLAIN, jax.lax.stop_gradient(guess), s)
         q = charge(jnp.concatenate([new, known]))
         i = alpha * (q - q_old) - beta * i_old
-        status = jnp.maximum(status, _status(last < V_TOL))
+        status = jnp.maximum(status, _status(last < V_TOL_STEP))
         full = jnp.concatenate([new, known])
         out = jnp.stack([full[r] for r in rows])
         return (new, new - v, known, q, i, status), out
@@ -344,6 +352,7 @@ def transient(
     # Linear prediction from the last step, none across the start of a piece.
     ratio = np.concatenate([[0.0], h[1:] / h[:-1]]) * ~time.begins
     later = {name: w[1:] for name, w in wave.items()}
+    outs: Array
     end, outs = jax.lax.scan(step, carry, (later, alpha, beta, jnp.asarray(ratio, dtype)))
     initial = jnp.stack([full[r] for r in rows])
     recorded = jnp.concatenate([initial[None], outs]).transpose(1, 0, 2)

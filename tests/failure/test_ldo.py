@@ -1,0 +1,128 @@
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from failure import circuits
+from failure.circuits.ldo import I_HEAVY, NETLIST, T_RISE, T_STEP, lowest, make_ldo, solve_ldo
+from failure.circuits.netlist import Mosfet
+from failure.circuits.solve import grid
+
+N = 8
+
+
+@pytest.fixture(scope="module")
+def samples() -> np.ndarray:
+    """Nominal, six Gaussian samples, a corner of the box."""
+    x = np.random.default_rng(7).normal(size=(N, 60))
+    x[0] = 0.0
+    x[-1] = 3.0 * np.sign(x[-1])
+    return x
+
+
+@pytest.fixture(scope="module")
+def solved(samples: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    specs, status = circuits.get("ldo").simulate(samples)
+    return np.asarray(specs), np.asarray(status)
+
+
+def test_interface() -> None:
+    circuit = circuits.get("ldo")
+    assert circuits.get("ldo") is circuit
+    assert circuit.n_dims == 60 and len(NETLIST.of(Mosfet)) == 20
+    assert circuit.parameter_names[:4] == (
+        ("MB1", "length"),
+        ("MB1", "vth"),
+        ("MB1", "tox"),
+        ("MB2", "length"),
+    )
+    lo, hi = circuit.bounds
+    assert lo.shape == (60,) and np.all(lo == -3.0) and np.all(hi == 3.0)
+    assert circuit.spec_names == ("quiescent_current", "undershoot", "load_regulation")
+    assert circuit.spec_index("undershoot") == 1
+    assert {s.sense for s in circuit.specs} == {"max"}
+
+
+def test_result_is_float64_and_converged(solved) -> None:
+    specs, status = solved
+    assert specs.dtype == np.float64 and specs.shape == (N, 3)
+    assert status.tolist() == [0] * N
+
+
+def test_recorded_numbers(samples, solved, golden: Path) -> None:
+    held = json.loads((golden / "circuits_ldo.json").read_text())
+    np.testing.assert_allclose(solved[0], held["specs"], rtol=1e-6)
+
+
+def test_a_sample_alone_is_the_sample_in_a_batch(samples, solved) -> None:
+    """Padding and chunks included: ten rows are two chunks when a chunk is eight."""
+    from failure.circuits.protocol import in_chunks
+
+    with jax.enable_x64(True):
+        x = jnp.asarray(np.concatenate([samples[::-1], samples[:2]]))
+        specs, status = jax.jit(lambda x: in_chunks(solve_ldo, x, chunk=N))(x)
+    np.testing.assert_allclose(specs[:N][::-1], solved[0], rtol=1e-9)
+    np.testing.assert_allclose(specs[N:], solved[0][:2], rtol=1e-9)
+    assert status.shape == (10,)
+
+
+def test_lowest_finds_the_vertex_of_a_parabola() -> None:
+    t = np.array([0.0, 0.3, 0.7, 1.0, 1.5])
+    with jax.enable_x64(True):
+        v = jnp.asarray(np.stack([(t - 0.6) ** 2 - 1.0, 2.0 - t], axis=1))
+        found = lowest(t, v)
+    np.testing.assert_allclose(found, [-1.0, 0.5], atol=1e-12)
+
+
+def test_bad_input_is_refused() -> None:
+    with pytest.raises(ValueError, match=r"unknown circuit 'lod'; known: "):
+        circuits.get("lod")
+    circuit = circuits.get("ldo")
+    with pytest.raises(ValueError, match=r"\[n, 60\], got \(3, 44\)"):
+        circuit.simulate(np.zeros((3, 44)))
+    with pytest.raises(ValueError, match="known: quiescent_current, undershoot"):
+        circuit.spec_index("dropout")
+
+
+@pytest.mark.slow
+def test_finer_grid_moves_the_undershoot_little() -> None:
+    """A tenth of the step changes the specification by less than 2 % of its spread."""
+    end = T_STEP + T_RISE
+    fine = grid((0.0, T_STEP, 1, 1.0), (T_STEP, end, 80, 1.0), (end, 14e-9, 240, 2.0),
+                (14e-9, 120e-9, 200, 20.0))  # fmt: skip
+    x = np.random.default_rng(3).normal(size=(60, 64))
+    with jax.enable_x64(True):
+        coarse, _ = jax.jit(solve_ldo)(jnp.asarray(x))
+        exact, _ = jax.jit(lambda x: solve_ldo(x, time=fine))(jnp.asarray(x))
+    move = np.abs(np.asarray(coarse - exact))[1].max()
+    assert move < 0.02 * np.asarray(exact)[1].std()
+
+
+@pytest.mark.slow
+def test_gradient_is_the_finite_difference() -> None:
+    x = np.random.default_rng(5).normal(size=(1, 60))
+    run = make_ldo().run
+    with jax.enable_x64(True):
+        at = jnp.asarray(x)
+        reverse = np.asarray(jax.jit(jax.jacrev(lambda x: run(x)[0][0]))(at))[:, 0]
+        evaluate = jax.jit(lambda x: run(x)[0][0])
+        for k in (0, 22, 31, 58):
+            h = 1e-3
+            step = jnp.zeros_like(at).at[0, k].set(h)
+            difference = np.asarray(evaluate(at + step) - evaluate(at - step)) / (2 * h)
+            np.testing.assert_allclose(
+                reverse[:, k], difference, rtol=1e-3, atol=1e-4 * np.abs(reverse).max(1).min()
+            )
+
+
+@pytest.mark.slow
+def test_samples_of_the_box_converge() -> None:
+    x = np.random.default_rng(11).uniform(-3, 3, size=(4096, 60))
+    _, status = circuits.get("ldo").simulate(x)
+    assert np.mean(np.asarray(status) != 0) < 1e-3
+    assert I_HEAVY > 0

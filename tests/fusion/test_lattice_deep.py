@@ -60,7 +60,8 @@ def test_output_falls_with_its_own_loss_and_is_free_in_the_others(
         losses[..., k] = sweep
         slopes.append(np.diff(np.asarray(targets(networks, jnp.asarray(losses))), axis=1))
     for k in range(K):
-        assert slopes[k][..., k].max() <= 0.0
+        # The parameters are exactly ordered; interpolation rounds to a unit or two of 1.0.
+        assert slopes[k][..., k].max() <= 2.5e-7
         assert slopes[k][..., k].min() < -1e-3
     others = np.stack([slopes[j][..., k] for k in range(K) for j in range(K) if j != k])
     assert others.max() > 1e-3 and others.min() < -1e-3

@@ -26,6 +26,10 @@ $(VENV)/.dev: pyproject.toml
 	@$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[dev]'
 	@touch $@ $(VENV)/.run
 
+demo: $(VENV)/.run  ## install what a run needs and show the main job, with pictures (<= 6 min)
+	@echo "== running the demo; pictures and numbers go to runs/demo"
+	$(BIN)/python scripts/demo.py
+
 test: $(VENV)/.dev  ## install what the tests need and run the default suite (<= 15 min on two cores)
 	@echo "== running the default test suite on $(JOBS) workers"
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile

@@ -97,6 +97,7 @@ class ModelConfig:
         gate_width: hidden units of the FC-con block.
         head_widths: hidden layers after fusion; `match_parameters` moves the first.
         aux_width: hidden units of each auxiliary head; 0 for a linear head.
+        embrace_width: width that EmbraceNet docks each sensor's features to before it draws.
         dropout: rate after fusion and in the head, in training.
         fusion: ``"concat"`` keeps each sensor's features apart, ``"sum"`` adds them.
         normalizer: of the fusion weights, see `fusion.gating.normalize`.
@@ -113,6 +114,7 @@ class ModelConfig:
     gate_width: int = 32
     head_widths: tuple[int, ...] = (128,)
     aux_width: int = 0
+    embrace_width: int = 128
     dropout: float = 0.2
     fusion: Literal["concat", "sum"] = "concat"
     scale: Literal["mean", "max"] = "mean"
@@ -193,7 +195,8 @@ class FusionNet(nn.Module):
         if key is not None and recipe.modality_dropout > 0.0:
             used = drop_modalities(jax.random.fold_in(key, 0), used, recipe.modality_dropout)
         if recipe.gate == "embrace":
-            h = embrace(used, None if key is None else jax.random.fold_in(key, 1))
+            docked = nn.relu(stacked_dense(self, "dock", used, config.embrace_width))
+            h = embrace(docked, None if key is None else jax.random.fold_in(key, 1))
         else:
             h = apply_weights(used, weights, config.fusion, config.scale)
         for layer, width in enumerate((*config.head_widths, config.n_classes)):

@@ -42,11 +42,11 @@ _SIMULATED = Preset(
         head_widths=(32,),
         dropout=0.1,
     ),
-    TrainConfig(epochs=10, batch_size=64, uniform_floor=1.0, label_smoothing=0.0),
-    HyperParams(3e-3, 1e-4, LossParams(alpha=1.0, beta=1.0, tau=0.5, anchor=0.3)),
+    TrainConfig(epochs=40, batch_size=32, uniform_floor=1.0, label_smoothing=0.0),
+    HyperParams(5e-3, 1e-4, LossParams(alpha=1.0, beta=1.0, tau=0.5, anchor=0.3)),
 )
 _BY_DATASET = {"har": _HAR, "driver": _DRIVER, "simulated": _SIMULATED}
-_QUICK_EPOCHS = {"har": 5, "driver": 2, "simulated": 5}
+_QUICK_EPOCHS = {"har": 5, "driver": 2, "simulated": 15}
 
 PRESETS = ("quick", "paper")
 

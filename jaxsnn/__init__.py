@@ -1,3 +1,66 @@
-"""Spiking networks that learn to steer: LIF, reward-modulated STDP, a robot world."""
+"""Spiking networks that learn to steer a robot by reward-modulated STDP, and the robot's world.
 
-__all__: list[str] = []
+Kernels: `neurons`, `plasticity`, `window`. Network: `encoding`, `rewards`, `architecture`,
+`network`, `settings`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`. Together: `agents`,
+`trials`, `qlearning`. Imported by name only, for what they bring along: `jaxsnn.ppo` (flax, optax),
+`jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
+"""
+
+from jaxsnn import (
+    agents,
+    architecture,
+    encoding,
+    geometry,
+    maps,
+    network,
+    neurons,
+    planner,
+    plasticity,
+    qlearning,
+    rewards,
+    scenarios,
+    settings,
+    trials,
+    window,
+    world,
+)
+from jaxsnn.maps import random_map
+from jaxsnn.network import network_config, network_params
+from jaxsnn.neurons import LIFParams, lif_step
+from jaxsnn.plasticity import STDPParams, apply_reward, stdp_step
+from jaxsnn.scenarios import scenario
+from jaxsnn.settings import network_setting
+from jaxsnn.trials import run_experiment, run_trial
+from jaxsnn.window import stdp_window
+
+__all__ = [
+    "LIFParams",
+    "STDPParams",
+    "agents",
+    "apply_reward",
+    "architecture",
+    "encoding",
+    "geometry",
+    "lif_step",
+    "maps",
+    "network",
+    "network_config",
+    "network_params",
+    "network_setting",
+    "neurons",
+    "planner",
+    "plasticity",
+    "qlearning",
+    "random_map",
+    "rewards",
+    "run_experiment",
+    "run_trial",
+    "scenario",
+    "scenarios",
+    "settings",
+    "stdp_step",
+    "stdp_window",
+    "trials",
+    "window",
+    "world",
+]

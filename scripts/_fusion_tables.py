@@ -10,13 +10,16 @@ import dataclasses
 import json
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from scripts import _run
 
+if TYPE_CHECKING:
+    from fusion.failures import FailureKind
+
 FIVE = ("baseline", "netgated", "argate_ws", "argate_plus", "argate_l")
 REFERENCES = ("oracle", "modality_dropout", "embracenet")
-UNSEEN_KINDS = ("zero", "stuck", "drift", "dropout", "gain", "clip")
+UNSEEN_KINDS: tuple[FailureKind, ...] = ("zero", "stuck", "drift", "dropout", "gain", "clip")
 
 
 @dataclasses.dataclass(frozen=True)

@@ -33,8 +33,10 @@ def test_advantages_in_closed_form() -> None:
     )
     # Cut off: the sum stops, the value of what follows counts. Terminated: it does not count.
     cut = [False, True, False]
-    np.testing.assert_allclose(advantages(no, cut), [first + 0.45 * middle, middle, last])
-    np.testing.assert_allclose(advantages(cut, cut), [first + 0.45 * 0.5, 0.5, last])
+    np.testing.assert_allclose(
+        advantages(no, cut), [first + 0.45 * middle, middle, last], rtol=1e-6
+    )
+    np.testing.assert_allclose(advantages(cut, cut), [first + 0.45 * 0.5, 0.5, last], rtol=1e-6)
 
 
 def _hit_the_mark(discount_steps: int) -> ppo.Env:
@@ -57,6 +59,7 @@ def _hit_the_mark(discount_steps: int) -> ppo.Env:
     return ppo.Env(reset, step, action_size=1)
 
 
+@pytest.mark.relaxed  # optax mixes int and float in the bias correction of Adam
 def test_it_finds_the_known_best_action_and_value() -> None:
     config = ppo.Config(
         n_envs=16, n_steps=16, n_updates=80, learning_rate=5e-3, discount=0.5, hidden=(32,)
@@ -77,6 +80,7 @@ def test_it_finds_the_known_best_action_and_value() -> None:
     assert result.metrics.entropy[-1] < result.metrics.entropy[0]
 
 
+@pytest.mark.relaxed  # optax, as above
 def test_robots_learn_to_arrive_in_scenario_1() -> None:
     config = ppo.Config(n_envs=8, n_steps=64, n_updates=40)
     env = ppo.navigation_env(scenarios.scenario(1), max_steps=100)

@@ -96,8 +96,10 @@ def main(config: Config) -> dict[str, Any]:
         for run in _fusion_tables.runs(table, config.seeds)
         if not config.models or run.model in config.models
     ]
-    # Whole seeds first, over all tables: an early stop then leaves complete tables of few seeds.
-    todo = sorted(todo, key=lambda run: run.seed)[index::count]
+    # The source's models first, seed by seed over all tables: an early stop then leaves complete
+    # tables of few seeds.
+    reference = _fusion_tables.REFERENCES
+    todo = sorted(todo, key=lambda run: (run.model in reference, run.seed))[index::count]
     todo = [] if config.collect_only else [run for run in todo if not run.path(out).exists()]
     if todo:
         _run.enable_compilation_cache()

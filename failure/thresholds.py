@@ -30,6 +30,7 @@ def reachable(
     column: int,
     task: Task,
     *,
+    sense: str = "max",
     share: float = 0.9,
     n_starts: int = 16,
     steps: int = 60,
@@ -46,8 +47,9 @@ def reachable(
 
     Args:
         run: pure ``x [n, D] -> (specs [n, m], status [n])``, differentiable.
-        column: which specification, larger is worse.
+        column: which specification.
         task: the feasible set.
+        sense: "max" when larger is worse, "min" when smaller is.
         share: :math:`\rho`.
         n_starts: starts, the nominal point and random ones.
         steps: of every ascent.
@@ -59,6 +61,7 @@ def reachable(
     """
     if not 0.0 < share < 1.0:
         raise ValueError(f"share={share}: expected a number between 0 and 1")
+    sign = 1.0 if sense == "max" else -1.0
     with jax.enable_x64(True):
         domain = task_domain(task)
         starts = sample(domain, jax.random.key(seed), n_starts - 1)
@@ -66,7 +69,7 @@ def reachable(
 
         def output(x: Any) -> tuple[Any, Any]:
             specs, status = run(x)
-            y = specs[:, column]
+            y = sign * specs[:, column]
             good = (status == 0) & jnp.isfinite(y)
             return jnp.sum(jnp.where(good, y, jnp.zeros_like(y))), jnp.where(good, y, -jnp.inf)
 
@@ -94,6 +97,6 @@ def reachable(
         (_, _, _, best_x, best_y), history = ascend(x0)
         best_x, best_y, history = np.asarray(best_x), np.asarray(best_y), np.asarray(history)
     top = int(np.argmax(best_y))
-    nominal, worst = float(history[0, 0]), float(best_y[top])
+    nominal, worst = sign * float(history[0, 0]), sign * float(best_y[top])
     threshold = nominal + share * (worst - nominal)
     return Reach(nominal, worst, best_x[top], threshold, n_starts * steps)

@@ -81,7 +81,7 @@ def threshold_for(circuit: Any, column: int, task: Any, out: Path) -> float:
     path = out / "threshold.json"
     if path.exists():
         return float(json.loads(path.read_text(encoding="utf-8"))["threshold"])
-    reach = reachable(circuit.run, column, task)
+    reach = reachable(circuit.run, column, task, sense=circuit.specs[column].sense)
     _run.write_json(path, reach._asdict())
     return reach.threshold
 

@@ -1,0 +1,247 @@
+"""Tables 4.1 and 4.2: all methods, all specifications, box and ball, many seeds.
+
+    python scripts/study_failures.py --circuit ldo --seeds 20 --out runs/table_4_1 --record
+    python scripts/study_failures.py --circuit dcdc --seeds 20 --out runs/table_4_2 --record
+
+One folder per specification, task and method; every simulation is logged as it comes, so the
+command can be killed and repeated. With `--record` the rows go to `results/table_4_1.json` or
+`table_4_2.json` after every method. Thresholds: 90 % of the way from nominal to the worst value
+that gradient ascents find; their probability for normal parameters by subset simulation.
+
+For one specification, task and method: about 3 CPU-minutes for 20 seeds, 10 with Rev-ARGate.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+from scripts import _run
+
+TABLES = {"ldo": ("4.1", "LDO regulator"), "dcdc": ("4.2", "DC-DC converter")}
+
+# Worst case and first failure of the source, for its own circuits and targets.
+SOURCE: dict[str, dict[str, dict[str, tuple[float, float | None]]]] = {
+    "ldo": {
+        "quiescent_current": {
+            "pBO": (9.4e-3, None), "HDBO": (10.35e-3, 92),
+            "Rev-ARGate zeros": (11.0e-3, 298), "Rev-ARGate BNN": (10.5e-3, 206),
+        },
+        "undershoot": {
+            "pBO": (0.31, None), "HDBO": (0.36, 221),
+            "Rev-ARGate zeros": (0.36, 262), "Rev-ARGate BNN": (0.37, 242),
+        },
+        "load_regulation": {
+            "pBO": (26.1, None), "HDBO": (29.1, 287),
+            "Rev-ARGate zeros": (27.2, 191), "Rev-ARGate BNN": (30.6, 261),
+        },
+    },
+    "dcdc": {
+        "output_accuracy": {
+            "pBO": (34.25e-3, None), "HDBO": (35.61e-3, None),
+            "Rev-ARGate zeros": (38.68e-3, 112), "Rev-ARGate BNN": (38.99e-3, 112),
+        },
+        "overshoot": {
+            "pBO": (10.31e-3, None), "HDBO": (11.11e-3, None),
+            "Rev-ARGate zeros": (9.5e-3, None), "Rev-ARGate BNN": (11.95e-3, 210),
+        },
+    },
+}  # fmt: skip
+
+# Features that the source found to matter.
+EMBEDDING_DIM = {"ldo": 22, "dcdc": 18}
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """What to run."""
+
+    circuit: str = "ldo"
+    """ldo (Table 4.1) or dcdc (Table 4.2)."""
+    specs: tuple[str, ...] = ()
+    """Specifications; all without."""
+    tasks: tuple[str, ...] = ("box", "ball")
+    """box and ball."""
+    methods: tuple[str, ...] = ()
+    """Methods; all without."""
+    seeds: int = 20
+    """Searches per method."""
+    n_total: int = 300
+    """Simulations per search."""
+    radius: float = 6.0
+    """Radius of the ball [sigma]."""
+    probability: bool = True
+    """Estimate the failure probability at each threshold."""
+    out: Path = Path("runs/study_failures")
+    """Folder of all runs."""
+    record: bool = False
+    """Write the table of record."""
+
+
+def cached(path: Path, make: Any) -> Any:
+    """A JSON value that is computed once."""
+    if path.exists():
+        return json.loads(path.read_text(encoding="utf-8"))
+    _run.write_json(path, make())
+    return json.loads(path.read_text(encoding="utf-8"))
+
+
+def describe(values: Any) -> dict[str, Any]:
+    """Number, median and quartiles, mean and its interval of the finite values; all values."""
+    import numpy as np
+
+    values = np.asarray(values, np.float64)
+    finite = values[np.isfinite(values)]
+    if finite.size == 0:
+        return {"n": len(values), "median": None, "iqr": None, "mean": None, "ci95": None,
+                "values": values.tolist()}  # fmt: skip
+    low, middle, high = np.quantile(finite, [0.25, 0.5, 0.75])
+    return {
+        **_run.summarize([float(v) for v in finite]),
+        "n": len(values),
+        "median": middle,
+        "iqr": [low, high],
+        "values": values.tolist(),
+    }
+
+
+def rows_of(
+    circuit: str, spec: Any, task: str, method: str, y: Any, target: dict[str, Any], seconds: float
+) -> list[dict[str, Any]]:
+    """The rows of one method: first failure, share of runs with one, worst case."""
+    import numpy as np
+
+    from failure.bayesopt import METHODS, best_so_far, first_hit
+
+    sign = 1.0 if spec.sense == "max" else -1.0
+    hits = first_hit(y, sign * target["threshold"])
+    label = METHODS[method].label
+    base = {
+        "row": f"{spec.name} ({task})",
+        "model": label,
+        "threshold": target["threshold"],
+        "nominal": target["nominal"],
+        "reachable": target["worst"],
+        "probability": target.get("probability"),
+        "cpu_s_per_seed": seconds,
+    }
+    source = SOURCE.get(circuit, {}).get(spec.name, {}).get(label) if task == "box" else None
+    extra = [{"source": source[i]} if source and source[i] is not None else {} for i in (0, 1)]
+    return [
+        {**base, "metric": "first_failure_hit", "unit": "simulations", **describe(hits),
+         **extra[1]},
+        {**base, "metric": "success_rate", "unit": "1", "n": len(hits),
+         "mean": float(np.isfinite(hits).mean())},
+        {**base, "metric": "worst_case", "unit": spec.unit,
+         **describe(sign * best_so_far(y)[:, -1]), **extra[0]},
+    ]  # fmt: skip
+
+
+def targets_of(config: Config, circuit: Any, column: int, task: Any, folder: Path) -> Any:
+    """Threshold of a task, and how likely it is for normal parameters."""
+    import jax
+
+    from failure.rare_events import subset_simulation
+    from failure.thresholds import reachable
+
+    spec = circuit.specs[column]
+    sign = 1.0 if spec.sense == "max" else -1.0
+
+    def signed(x: Any) -> Any:
+        specs, status = circuit.run(x)
+        return sign * specs, status
+
+    target = cached(
+        folder / "threshold.json",
+        lambda: reachable(circuit.run, column, task, sense=spec.sense)._asdict(),
+    )
+    if config.probability:
+        import jax.numpy as jnp
+
+        def performance(x: Any) -> Any:
+            specs, status = signed(x)
+            return jnp.where(status == 0, specs[:, column], jnp.nan)
+
+        target["probability"] = cached(
+            folder / "probability.json",
+            lambda: subset_simulation(
+                jax.random.key(0), performance, sign * target["threshold"], task.dim,
+                n=500, replicates=4, max_levels=12,
+            )._asdict(),
+        )  # fmt: skip
+    return target
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Run or finish the study; returns all rows."""
+    import time
+
+    from failure import circuits, plots
+    from failure.bayesopt import METHODS, SearchConfig
+    from failure.embeddings import Task
+    from failure.runs import run
+
+    circuit = circuits.get(config.circuit)
+    table, title = TABLES.get(config.circuit, (config.circuit, config.circuit))
+    names = config.specs or circuit.spec_names
+    methods = config.methods or tuple(METHODS)
+    columns = [circuit.spec_index(name) for name in names]
+    _run.enable_compilation_cache()
+    rows: list[dict[str, Any]] = []
+    with _run.progress() as bar:
+        job = bar.add_task("study", total=len(names) * len(config.tasks) * len(methods), status="")
+        for column in columns:
+            spec = circuit.specs[column]
+            for kind in config.tasks:
+                size = circuit.box if kind == "box" else config.radius
+                task = Task(kind, float(size), circuit.n_dims)
+                folder = config.out / config.circuit / spec.name / kind
+                target = targets_of(config, circuit, column, task, folder)
+                outputs = {}
+                for method in methods:
+                    bar.update(job, status=f"{spec.name} {kind} {method}")
+                    search = SearchConfig(
+                        task,
+                        method,
+                        seeds=tuple(range(config.seeds)),
+                        n_total=config.n_total,
+                        embedding_dim=EMBEDDING_DIM.get(config.circuit),
+                    )
+                    started = time.process_time()
+                    state = run(
+                        search, circuit.simulate, column, sense=spec.sense, folder=folder / method
+                    )
+                    spent = (time.process_time() - started) / config.seeds
+                    seconds = cached(folder / method / "cpu.json", lambda s=spent: {"seconds": s})
+                    outputs[METHODS[method].label] = state.y
+                    new = rows_of(
+                        config.circuit, spec, kind, method, state.y, target, seconds["seconds"]
+                    )
+                    rows += new
+                    if config.record:
+                        path = _run.RESULTS / f"table_{table.replace('.', '_')}.json"
+                        _run.record_table(path, table, title, new, preset="paper")
+                    bar.advance(job)
+                sign = 1.0 if spec.sense == "max" else -1.0
+                plots.plot_trend(
+                    folder / "trend.png",
+                    outputs,
+                    threshold=sign * target["threshold"],
+                    n_init=50,
+                    label=f"{spec.name} [{spec.unit}]",
+                )
+    _run.write_json(config.out / f"rows_{config.circuit}.json", rows)
+    solved = [row["mean"] for row in rows if row["metric"] == "success_rate"]
+    _run.print_result(rows=len(rows), mean_success=sum(solved) / max(len(solved), 1))
+    return {"rows": rows}
+
+
+if __name__ == "__main__":
+    import tyro
+
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except ValueError as error:
+        _run.fail(str(error))

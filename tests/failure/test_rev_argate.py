@@ -1,0 +1,104 @@
+import dataclasses
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from failure import bayesopt, embeddings, rev_argate, runs
+from failure.acquisition import AcquisitionConfig
+from failure.bnn import BNNConfig
+from failure.embeddings import Task
+
+DIM = 6
+TASK = Task("box", 3.0, DIM)
+CONFIG = rev_argate.RevArgateConfig(
+    depth=2, gate_width=8, steps=250, restoration=BNNConfig(hidden=8, steps=50)
+)
+
+
+def specification(x):
+    """Two of six parameters matter."""
+    x = np.asarray(x)
+    return (x[:, 1] + 0.3 * x[:, 4] ** 2)[:, None], np.zeros(len(x), int)
+
+
+@pytest.fixture(scope="module")
+def trained():
+    rng = np.random.default_rng(0)
+    x = rng.uniform(-3, 3, (120, DIM))
+    y = specification(x)[0][:, 0]
+    scaled = jnp.asarray(x / np.sqrt(3.0), jnp.float32)
+    target = jnp.asarray((y - y.mean()) / y.std(), jnp.float32)
+    fit = jax.jit(rev_argate.fit, static_argnums=1)
+    params, losses = fit(jax.random.key(0), CONFIG, scaled, target, jnp.ones(120))
+    return params, losses, scaled, target
+
+
+def test_training_explains_the_target(trained):
+    params, losses, x, y = trained
+    assert losses[-1] < 0.3 * losses[0]
+    error = rev_argate.predict(CONFIG, params, x) - y
+    assert float(jnp.mean(error**2)) < 0.35
+
+
+def test_weights_sum_to_one_and_rank_the_features(trained):
+    params, _, x, _ = trained
+    weights = rev_argate.fusion_weights(CONFIG, params, x)
+    np.testing.assert_allclose(weights.sum(1), 1.0, rtol=1e-5)
+    order, n_active = rev_argate.active_features(weights, 0.8)
+    mean = np.asarray(weights).mean(0)
+    assert np.all(np.diff(mean[order]) <= 0)
+    assert mean[order[:n_active]].sum() >= 0.8 > mean[order[: n_active - 1]].sum()
+
+
+def test_loss_is_equation_4_6(trained):
+    params, _, x, y = trained
+    mask = jnp.ones(120)
+    parts = {}
+    for name in ("alpha", "beta", "anchor"):
+        only = dataclasses.replace(CONFIG, **{"alpha": 0.0, "beta": 0.0, "anchor": 0.0, name: 1.0})
+        total, main = rev_argate.loss(only, params, x, y, mask)
+        parts[name] = float(total - main)
+        assert parts[name] > 0
+    config = dataclasses.replace(CONFIG, alpha=0.5, beta=2.0, anchor=3.0)
+    total, main = rev_argate.loss(config, params, x, y, mask)
+    expected = float(main) + 0.5 * parts["alpha"] + 2.0 * parts["beta"] + 3.0 * parts["anchor"]
+    np.testing.assert_allclose(total, expected, rtol=1e-4)
+    # masked rows do not count
+    doubled, _ = rev_argate.loss(
+        config, params, jnp.concatenate([x, x]), jnp.concatenate([y, 99 * y]),
+        jnp.concatenate([mask, 0 * mask]),
+    )  # fmt: skip
+    np.testing.assert_allclose(doubled, total, rtol=1e-4)
+
+
+def test_search_trains_on_counted_simulations_and_resumes(tmp_path):
+    search = bayesopt.SearchConfig(
+        TASK, "rev_argate_bnn", seeds=(0, 1), n_init=10, n_total=16, embedding_dim=3,
+        retrain_every=3, acquisition=AcquisitionConfig(n_raw=32, n_restarts=2, max_evals=20),
+        rev_argate=dataclasses.replace(CONFIG, steps=30),
+    )  # fmt: skip
+    counted = []
+
+    def simulate(x):
+        if sum(counted) >= 2 * 14 and not tmp_path.joinpath("free").exists():
+            raise KeyboardInterrupt
+        counted.append(len(x))
+        return specification(x)
+
+    with pytest.raises(KeyboardInterrupt):
+        runs.run(search, simulate, folder=tmp_path)
+    tmp_path.joinpath("free").touch()
+    end = runs.run(search, simulate, folder=tmp_path)
+    assert sum(counted) == 2 * 16 and end.y.shape == (2, 16)
+    assert end.space_at == 13 and end.u.shape == (2, 16, 3)
+    assert isinstance(end.space, embeddings.ReversedFeatures)
+    assert end.space.restoration is not None and end.space.shift.dtype == np.float64
+    whole = runs.run(search, specification)
+    np.testing.assert_allclose(whole.x, end.x, rtol=1e-9, atol=1e-9)
+
+
+def test_bad_configuration():
+    with pytest.raises(ValueError, match="tau=0"):
+        rev_argate.RevArgateConfig(tau=0.0)

@@ -139,6 +139,10 @@ class NetworkParams(NamedTuple):
         init_low: initial weights are uniform between this fraction of their bound and the bound.
         gain_input, gain_output: what a weight is multiplied with to give the jump of the potential.
         steering_gain: degrees per Hz of difference between the motors; 1 is the source.
+        homeostasis: rate of synaptic scaling [1/s]; 0 is the source. While a neuron fires above
+            its target rate, its excitatory inputs shrink and its inhibitory ones grow, and the
+            other way round below it. Without it, what has grown fires more and grows faster.
+        rate_hidden, rate_output: target rates of the scaling [Hz].
     """
 
     hidden: LIFParams = LIFParams()
@@ -154,6 +158,9 @@ class NetworkParams(NamedTuple):
     gain_input: float | Array = 1.0
     gain_output: float | Array = 1.0
     steering_gain: float | Array = 1.0
+    homeostasis: float | Array = 0.0
+    rate_hidden: float | Array = 25.0
+    rate_output: float | Array = 60.0
 
 
 class Weights(NamedTuple):
@@ -190,9 +197,10 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
     check_lif(params.output, dt=config.dt)
     check_stdp(params.stdp, dt=config.dt)
     check_rewards(params.reward)
-    for name in ("w_max", "w_max_low", "gain_input", "gain_output"):
-        require_positive(name, getattr(params, name), "give it in millivolts (gains: a number)")
-    for name in ("gamma", "gamma_output", "w_min", "init_low"):
+    positive = ("w_max", "w_max_low", "gain_input", "gain_output", "rate_hidden", "rate_output")
+    for name in positive:
+        require_positive(name, getattr(params, name), "give it in mV (rates: Hz)")
+    for name in ("gamma", "gamma_output", "w_min", "init_low", "homeostasis"):
         require_positive(name, getattr(params, name), "give a number >= 0", zero=True)
     require_finite("steering_gain", params.steering_gain, "give degrees per Hz")
 

@@ -60,10 +60,19 @@ class NetworkState(NamedTuple):
 
 
 class Eligibility(NamedTuple):
-    """Time integral of `z` over a window [mV], same shapes as `Weights`."""
+    """What `reinforce` needs to know of a window.
+
+    Attributes:
+        hidden, output: time integral of `z` [mV], same shapes as `Weights`.
+        hidden_count, output_count: spikes of each neuron.
+        duration: of the window [s].
+    """
 
     hidden: Float[Array, "n_in n_hidden"]
     output: Float[Array, "2 n_half"]
+    hidden_count: Float[Array, " n_hidden"]
+    output_count: Float[Array, "2"]
+    duration: float | Array
 
 
 class Spikes(NamedTuple):
@@ -180,7 +189,13 @@ def step(
     stdp_output = jax.vmap(lambda s, x, y: stdp_step(params.stdp, s, x, y, dt=config.dt))(
         state.stdp_output, spikes.hidden.reshape(2, -1), spikes.output[:, None]
     )
-    held = Eligibility(stdp_hidden.z * config.dt, stdp_output.z[..., 0] * config.dt)
+    held = Eligibility(
+        hidden=stdp_hidden.z * config.dt,
+        output=stdp_output.z[..., 0] * config.dt,
+        hidden_count=spikes.hidden,
+        output_count=spikes.output,
+        duration=config.dt,
+    )
     weights = reinforce(config, params, weights, held, reward)
     return NetworkState(weights, hidden, output, stdp_hidden, stdp_output), spikes
 
@@ -242,7 +257,14 @@ def window(
         stdp, state.stdp_output, halves, spikes.output[:, :, None], keep
     )
     state = state._replace(stdp_hidden=stdp_hidden, stdp_output=stdp_output)
-    return state, Eligibility(first, second[..., 0]), spikes
+    held = Eligibility(
+        hidden=first,
+        output=second[..., 0],
+        hidden_count=jnp.sum(spikes.hidden, axis=0),
+        output_count=jnp.sum(spikes.output, axis=0),
+        duration=pre.shape[0] * config.dt,
+    )
+    return state, held, spikes
 
 
 def reinforce(
@@ -251,33 +273,51 @@ def reinforce(
     weights: Weights,
     eligibility: Eligibility,
     reward: Float[Array, "2"],
+    active: float | Float[Array, ""] = 1.0,
 ) -> Weights:
-    """Change the weights by a reward held over the window that the eligibility is from.
+    r"""Change the weights by a reward held over the window that the eligibility is from.
+
+    .. math:: d_{ij} = \gamma\, s_{ij}\, r_{motor} \int z_{ij}\,dt, \qquad
+              h_i = \eta \int (1 - \nu_i / \nu^*)\,dt
+
+    `d` goes through the rule (`plasticity.apply_reward`); with homeostasis `eta > 0` weights are
+    scaled by :math:`e^{s_{pre} h_i}` before, `nu` being the rate of the neuron they lead to.
 
     Args:
         config: NetworkConfig.
         params: NetworkParams.
         weights: Weights.
-        eligibility: time integral of `z`, from `window`.
+        eligibility: of the window, from `window`.
         reward: for the synapses of the left and of the right motor, `[2]`.
+        active: 0. to leave the weights as they are, else 1.
 
     Returns:
         The new weights, inside their bounds.
 
     Source:
-        Shim (2020), Eq. 2.3 or 2.8 with the sign adjustment of section 2.3.2.
+        Shim (2020), Eq. 2.3 or 2.8 with the sign adjustment of section 2.3.2. Homeostasis is ours.
     """
     sign_pre, sign_hidden = (jnp.asarray(s) for s in neuron_signs(config))
     to_first, to_second = synapse_signs(sign_pre, sign_hidden)
-    by_neuron = params.gamma * jnp.repeat(reward, config.n_half)
+    gamma, eta = active * params.gamma, active * params.homeostasis
+    by_neuron = gamma * jnp.repeat(reward, config.n_half)
     drives = Weights(
         hidden=to_first * by_neuron[None, :] * eligibility.hidden,
         output=(params.gamma_output * to_second * by_neuron).reshape(2, -1) * eligibility.output,
+    )
+    short_hidden = eta * (eligibility.duration - eligibility.hidden_count / params.rate_hidden)
+    short_output = eta * (eligibility.duration - eligibility.output_count / params.rate_output)
+    scaled = Weights(
+        hidden=weights.hidden
+        * jnp.where(
+            sign_pre[:, None] > 0, jnp.exp(short_hidden)[None], jnp.exp(-short_hidden)[None]
+        ),
+        output=weights.output * jnp.exp(short_output[:, None] * sign_hidden.reshape(2, -1)),
     )
     bounds = weight_bounds(config, params)
     return Weights(
         *(
             apply_reward(w, d, params.w_min, top, rule=config.rule, bounds=config.bounds)
-            for w, d, top in zip(weights, drives, bounds, strict=True)
+            for w, d, top in zip(scaled, drives, bounds, strict=True)
         )
     )

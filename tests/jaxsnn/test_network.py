@@ -153,7 +153,7 @@ def test_reward_moves_the_synapses_the_text_says():
     """With eligibility 1 everywhere, the change has the sign of section 2.3.2, per motor."""
     params = params_of(SMALL, gamma=0.1)
     weights = Weights(jnp.full((56, 24), 1.0), jnp.full((2, 12), 1.0))
-    ones = network.Eligibility(jnp.ones((56, 24)), jnp.ones((2, 12)))
+    ones = eligibility(1.0)
     new = network.reinforce(SMALL, params, weights, ones, jnp.array([1.0, -0.5]))
     pre, hidden = neuron_signs(SMALL)
     reward = np.repeat([1.0, -0.5], 12)
@@ -163,6 +163,27 @@ def test_reward_moves_the_synapses_the_text_says():
     np.testing.assert_allclose(
         jnp.log(new.output), 0.1 * (hidden * reward).reshape(2, 12), rtol=1e-4, atol=1e-6
     )
+
+
+def eligibility(z, count=0.0):
+    return network.Eligibility(
+        jnp.full((56, 24), z), jnp.full((2, 12), z), jnp.full(24, count), jnp.full(2, count), 0.1
+    )
+
+
+def test_homeostasis_works_against_the_rate():
+    """Above its target rate a neuron loses excitation and gains inhibition; at it, nothing."""
+    params = params_of(SMALL, homeostasis=1.0, rate_hidden=50.0, rate_output=50.0)
+    weights = Weights(jnp.full((56, 24), 1.0), jnp.full((2, 12), 1.0))
+    pre, hidden = neuron_signs(SMALL)
+    for count, change in ((0.0, 0.1), (5.0, 0.0), (10.0, -0.1)):
+        new = network.reinforce(SMALL, params, weights, eligibility(0.0, count), jnp.zeros(2))
+        want = change * np.broadcast_to(pre[:, None], (56, 24))
+        np.testing.assert_allclose(jnp.log(new.hidden), want, rtol=1e-4, atol=1e-6)
+        want = change * hidden.reshape(2, 12)
+        np.testing.assert_allclose(jnp.log(new.output), want, rtol=1e-4, atol=1e-6)
+    still = network.reinforce(SMALL, params, weights, eligibility(1.0, 9.0), jnp.ones(2), 0.0)
+    np.testing.assert_array_equal(still.hidden, weights.hidden)
 
 
 def test_weights_stay_magnitudes_in_their_bounds(runs):

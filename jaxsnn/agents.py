@@ -1,0 +1,198 @@
+"""A spiking network as an agent: what it does with a reading, what it learns from the outcome.
+
+An agent is three pure functions, `init`, `act` and `learn`, so that `trials.py` can drive any other
+agent as well. All take the agent's parameters first; nothing is kept in the agent itself.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxsnn import network
+from jaxsnn.architecture import NetworkConfig, NetworkParams, check_network
+from jaxsnn.encoding import group_rates, poisson_spikes
+from jaxsnn.network import Eligibility, NetworkState
+from jaxsnn.rewards import motor_rewards, terminal_reward
+from jaxsnn.window import STDPKernel
+from jaxsnn.world import Outcome, Reading
+
+__all__ = ["Agent", "SNNMemory", "SNNParams", "snn_agent", "snn_params", "steering_angle"]
+
+
+class Agent(NamedTuple):
+    """What `trials.py` needs of an agent; `P`, `S` and `M` are pytrees of the agent's own.
+
+    Attributes:
+        init: `(key, P) -> S`, a naive agent.
+        act: `(P, S, reading, key, fresh, active) -> (S, steering, M, info)`. `fresh` is true in the
+            first step of a trial. With `active` false nothing may be learnt. Steering is in
+            degrees, positive to the left; `info` is a vector that trials average.
+        learn: `(P, S, M, outcome, next_reading, active) -> S`; the reading is None unless
+            `needs_next`.
+        finite: `S -> bool`, false once something in the agent is not a number.
+        needs_next: whether `learn` looks at the reading after the move.
+        info: names of the entries of `info`.
+    """
+
+    init: Callable[..., Any]
+    act: Callable[..., Any]
+    learn: Callable[..., Any]
+    finite: Callable[..., Any]
+    needs_next: bool = False
+    info: tuple[str, ...] = ()
+
+
+class SNNParams(NamedTuple):
+    """`NetworkParams` and what is worked out from them once; made by `snn_params`."""
+
+    network: NetworkParams
+    kernel: STDPKernel
+
+
+class SNNMemory(NamedTuple):
+    """Eligibility of the last held window and the reward for what was seen."""
+
+    eligibility: Eligibility | None
+    reward: Float[Array, "2"]
+
+
+def snn_params(config: NetworkConfig, params: NetworkParams) -> SNNParams:
+    """Parameters of the agent: checked constants and the pair kernel.
+
+    Raises:
+        ValueError: a constant is not acceptable (traced constants are not checked).
+    """
+    check_network(config, params)
+    return SNNParams(network=params, kernel=network.kernel(config, params))
+
+
+def steering_angle(params: NetworkParams, rates: Float[Array, "2"]) -> Float[Array, ""]:
+    r"""Turn of the robot from the firing rates of the motors [deg], positive to the left.
+
+    .. math:: \theta = g\,(freq_r - freq_l)
+
+    Args:
+        params: NetworkParams; `steering_gain` is `g` [deg/Hz], 1 in the source.
+        rates: of the left and the right motor neuron [Hz].
+
+    Source:
+        Shim (2020), section 2.4.3. The sign is that of our world: the source writes
+        `freq_l - freq_r` and steers left when that is negative.
+    """
+    return params.steering_gain * (rates[1] - rates[0])
+
+
+def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
+    """The network as an agent.
+
+    In a control step the inputs fire at the rates of the reading for `config.control_steps`, in
+    windows of `config.hold_steps`. Rewards for avoidance and target hold during the step and change
+    the weights after each window. Collision or arrival, known after the move, replaces them in the
+    last window.
+
+    Args:
+        config: NetworkConfig.
+        plastic: False for frozen weights: nothing is learnt, and traces are not computed.
+
+    Returns:
+        Agent whose parameters are `SNNParams` and whose state is `NetworkState`.
+    """
+    n_windows = config.control_steps // config.hold_steps
+    table = config.rates
+
+    def init(key: Key[Array, ""], params: SNNParams) -> NetworkState:
+        return network.init(key, config, params.network)
+
+    def act(
+        params: SNNParams,
+        state: NetworkState,
+        reading: Reading,
+        key: Key[Array, ""],
+        fresh: Bool[Array, ""],
+        active: Bool[Array, ""],
+    ) -> tuple[NetworkState, Float[Array, ""], SNNMemory, Float[Array, "3"]]:
+        constants = params.network
+        by_group = group_rates(table, reading.sonar, reading.distance, reading.angle)
+        rates = jnp.repeat(by_group, config.group_exc + config.group_inh)
+        reward = motor_rewards(constants.reward, reading.sonar, reading.distance, reading.angle)
+        state = network.settle(constants, state, fresh)
+
+        def draw(index: Array | int) -> Array:
+            window_key = jax.random.fold_in(key, index)
+            return poisson_spikes(window_key, rates, config.hold_steps, dt=config.dt)
+
+        def run(state: NetworkState, index: Array | int, keep: Any) -> tuple:
+            pre = draw(index)
+            if not plastic:
+                state, spikes = network.fire(config, constants, state, pre)
+                return state, None, spikes
+            return network.window(config, constants, params.kernel, state, pre, keep)
+
+        def count(spikes: network.Spikes) -> Array:
+            hidden = jnp.sum(spikes.hidden) / config.n_hidden
+            return jnp.append(jnp.sum(spikes.output, axis=0), hidden)
+
+        keep = 1.0 - fresh.astype(jnp.float32)
+        going = active.astype(jnp.float32)
+        total = jnp.zeros((3,), jnp.float32)
+        if n_windows > 1:
+
+            def body(carry: tuple, index: Array) -> tuple:
+                state, total = carry
+                held_keep = jnp.where(index == 0, keep, 1.0)
+                state, held, spikes = run(state, index, held_keep)
+                if plastic:
+                    weights = network.reinforce(
+                        config, constants, state.weights, held, reward, going
+                    )
+                    state = state._replace(weights=weights)
+                return (state, total + count(spikes)), None
+
+            (state, total), _ = jax.lax.scan(body, (state, total), jnp.arange(n_windows - 1))
+            keep = jnp.ones_like(keep)
+        state, held, spikes = run(state, n_windows - 1, keep)
+        firing = (total + count(spikes)) / (config.control_steps * config.dt)
+        steering = steering_angle(constants, firing[:2])
+        return state, steering, SNNMemory(held, reward), firing
+
+    def learn(
+        params: SNNParams,
+        state: NetworkState,
+        memory: SNNMemory,
+        outcome: Outcome,
+        next_reading: Reading | None,
+        active: Bool[Array, ""],
+    ) -> NetworkState:
+        if not plastic or memory.eligibility is None:
+            return state
+        constants = params.network
+        reward = memory.reward
+        if config.reward_timing == "after" and next_reading is not None:
+            reward = motor_rewards(
+                constants.reward, next_reading.sonar, next_reading.distance, next_reading.angle
+            )
+        end = terminal_reward(constants.reward, outcome.collided, outcome.arrived)
+        reward = jnp.where(outcome.collided | outcome.arrived, end, reward)
+        going = active.astype(jnp.float32)
+        weights = network.reinforce(
+            config, constants, state.weights, memory.eligibility, reward, going
+        )
+        return state._replace(weights=weights)
+
+    def finite(state: NetworkState) -> Bool[Array, ""]:
+        # A weight that is not a number makes the potential of its neuron one that is not.
+        return jnp.all(jnp.isfinite(state.hidden.v)) & jnp.all(jnp.isfinite(state.output.v))
+
+    return Agent(
+        init=init,
+        act=act,
+        learn=learn,
+        finite=finite,
+        needs_next=plastic and config.reward_timing == "after",
+        info=("left motor [Hz]", "right motor [Hz]", "hidden [Hz]"),
+    )

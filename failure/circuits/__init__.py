@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+from failure.circuits.dcdc import make_dcdc
 from failure.circuits.ldo import make_ldo
 from failure.circuits.protocol import Circuit, Spec
 
-__all__ = ["CIRCUITS", "Circuit", "Spec", "get", "make_ldo"]
+__all__ = ["CIRCUITS", "Circuit", "Spec", "get", "make_dcdc", "make_ldo"]
 
-CIRCUITS: dict[str, Callable[[], Circuit]] = {"ldo": make_ldo}
+CIRCUITS: dict[str, Callable[[], Circuit]] = {"dcdc": make_dcdc, "ldo": make_ldo}
 """Name -> function that makes the circuit."""
 
 

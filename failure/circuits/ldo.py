@@ -48,11 +48,11 @@ SPECS = (
 )
 
 
-def _n(name: str, d: str, g: str, s: str, width: float, length: float) -> Mosfet:
+def _n(name: str, d: str, g: str, s: str, width: int | float, length: float) -> Mosfet:
     return Mosfet(name, d, g, s, "0", NMOS, width * 1e-6, length * 1e-6)
 
 
-def _p(name: str, d: str, g: str, s: str, width: float, length: float) -> Mosfet:
+def _p(name: str, d: str, g: str, s: str, width: int | float, length: float) -> Mosfet:
     return Mosfet(name, d, g, s, "vin", PMOS, width * 1e-6, length * 1e-6)
 
 

@@ -120,4 +120,4 @@ def dcdc_reference(
     decks = dcdc_decks(x, model=model, max_step=max_step)
     numbers, status = ngspice.run_many(decks, ("vmean", "vpeak"), workers=workers, timeout=timeout)
     mean, peak = numbers.T
-    return np.stack([np.abs(mean - dcdc.V_REF), peak - mean], axis=1), status
+    return np.stack([np.abs(mean - dcdc.V_REF), peak - dcdc.V_REF], axis=1), status

@@ -99,13 +99,18 @@ def stage_matrix(
     out = jnp.stack([p.r_esr, one, zero, zero, -p.r_esr * load])
     unit_z = jnp.stack([zero, zero, one, zero, zero])
     unit_1 = jnp.stack([zero, zero, zero, zero, one])
+    unit_i = jnp.stack([one, zero, zero, zero, zero])
     g = 1.0 / p.r_comp + p.go + 1.0 / p.r_zero
     fixed = p.v_ref / p.r_comp + p.go * p.v_comp + p.i_offset - p.gm * p.v_ref
-    comp = (out * (p.gm + 1.0 / p.r_zero) + unit_z / p.r_zero + unit_1 * fixed) / g
-    unit_i = jnp.stack([one, zero, zero, zero, zero])
-    coil = (unit_1 * v_switch - unit_i * (r_switch + p.r_coil) - out) / p.inductance
-    cap = (unit_i - unit_1 * load) / p.capacitance
-    zero_row = (comp - unit_z - out) / (p.r_zero * p.c_zero)
+    comp = (
+        out * ((p.gm + 1.0 / p.r_zero) / g)[None]
+        + unit_z * (1.0 / (p.r_zero * g))[None]
+        + unit_1 * (fixed / g)[None]
+    )
+    drop = unit_i * (r_switch + p.r_coil)[None]
+    coil = (unit_1 * v_switch[None] - drop - out) / p.inductance[None]
+    cap = (unit_i - unit_1 * load[None]) / p.capacitance[None]
+    zero_row = (comp - unit_z - out) / (p.r_zero * p.c_zero)[None]
     return jnp.stack([coil, cap, zero_row, out, jnp.zeros_like(out)]), out, comp
 
 
@@ -146,14 +151,14 @@ def pwm_cycle(
     # Floor and ceiling of the duty cycle: the ramp ends, and a trip cannot lie before the fall.
     least, most = 0.02 * period, 0.98 * period
     for _ in range(iterations):
-        here = _apply(expm(a_low * t), x)
+        here = _apply(expm(a_low * t[None, None]), x)
         gap = jnp.sum(comp_row * here, axis=0) - (ramp_start + ramp_slope * (t - t_ramp))
         rate = jnp.sum(comp_row * _apply(a_low, here), axis=0) - ramp_slope
         t = jnp.clip(t - gap / jnp.minimum(rate, -0.2 * ramp_slope), least, most)
     rise = jnp.clip(t + delay, least, most)
 
     def walk(x: Array, a: Array, row: Array, length: Array) -> tuple[Array, Array]:
-        step = expm(a * (length / points))
+        step = expm(a * (length / points)[None, None])
         peak = jnp.sum(row * x, axis=0)
         for _ in range(points):
             new = _apply(step, x)

@@ -178,7 +178,7 @@ class Solution(NamedTuple):
 def dc(
     system: System,
     values: Values,
-    v0: Float[Array, "n b"] | None = None,
+    v0: Float[Array, "n #b"] | None = None,
     *,
     max_iterations: int = 40,
 ) -> Solution:
@@ -258,7 +258,7 @@ def transient(
     values: Values,
     start: Solution,
     time: Grid,
-    waveforms: dict[str, Float[Array, "t b"]],
+    waveforms: dict[str, Float[Array, "t #b"]],
     *,
     probes: tuple[str, ...],
     max_iterations: int = 60,

@@ -189,7 +189,9 @@ def fit(
     def step(carry: tuple, sub: Array) -> tuple[tuple, Array]:
         free, state = carry
         loss, grad = jax.value_and_grad(lambda f: negative_elbo(config, join(f), x, y, sub))(free)
-        update, state = optimiser.update(grad, state)
+        # optax raises a Python float to an integer power, which strict promotion forbids.
+        with jax.numpy_dtype_promotion("standard"):
+            update, state = optimiser.update(grad, state)
         return (optax.apply_updates(free, update), state), loss
 
     keys = jax.random.split(key_fit, config.steps)

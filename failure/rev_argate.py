@@ -208,7 +208,9 @@ def fit(
         )
         # The time step h is a constant of the network, not a weight.
         grad = grad._replace(network=grad.network._replace(step=jnp.zeros_like(grad.network.step)))
-        update, state = optimiser.update(grad, state, params)
+        # optax raises a Python float to an integer power, which strict promotion forbids.
+        with jax.numpy_dtype_promotion("standard"):
+            update, state = optimiser.update(grad, state, params)
         update = update._replace(
             network=update.network._replace(step=jnp.zeros_like(update.network.step))
         )

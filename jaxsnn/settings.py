@@ -25,8 +25,8 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "tuned": {
         "config": {"control_steps": 200, "hold_steps": 100, "angle_code": "ring"},
         "params": {
-            "gamma": 1e-3,
-            "homeostasis": 0.2,
+            "gamma": 1e-4,
+            "homeostasis": 0.02,
             "rate_hidden": 25.0,
             "rate_output": 60.0,
         },

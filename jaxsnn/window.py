@@ -120,13 +120,17 @@ def stdp_window(
     p_plus, p_minus = keep * state.traces.p_plus, keep * state.traces.p_minus
     pre_rows = jnp.concatenate([pre, p_plus[None]])
     post_rows = jnp.concatenate([post, p_minus[None]])
-    # The small matrix is applied to the smaller layer; the rest is one product over time.
-    if pre.shape[-1] <= post.shape[-1]:
-        folded = jnp.einsum("kts,sj->ktj", kernel.pairs, pre_rows)
-        change = jnp.einsum("ktj,ti->kji", folded, post_rows)
+    # The small matrix is applied to the smaller layer; the rest is one product over time. The step
+    # comes first in both factors, so that nothing has to be transposed between the products.
+    n_pre, n_post = pre.shape[-1], post.shape[-1]
+    if n_pre <= n_post:
+        folded = jnp.einsum("kts,sj->tkj", kernel.pairs, pre_rows)
+        change = folded.reshape(-1, 2 * n_pre).T @ post_rows
+        change = change.reshape(2, n_pre, n_post)
     else:
-        folded = jnp.einsum("kts,ti->ksi", kernel.pairs, post_rows)
-        change = jnp.einsum("sj,ksi->kji", pre_rows, folded)
+        folded = jnp.einsum("kts,ti->ski", kernel.pairs, post_rows)
+        change = pre_rows.T @ folded.reshape(-1, 2 * n_post)
+        change = jnp.moveaxis(change.reshape(n_pre, 2, n_post), 1, 0)
     carry = keep * kernel.carry
     traces = Traces(
         p_plus=kernel.carry_plus * p_plus + kernel.plus @ pre,

@@ -2,7 +2,7 @@
 
 "literal" is the source wherever it speaks; what it leaves open (window, learning rate, time
 constant of the eligibility trace, threshold) has our values in both. "tuned" adds the readings and
-options below; `docs/snn_networks.md` says which study chose them and what each one does.
+options below; `docs/snn_networks.md` says what each one does and how its value was chosen.
 """
 
 from __future__ import annotations

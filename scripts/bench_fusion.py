@@ -329,7 +329,7 @@ def main(config: Config) -> dict[str, Any]:
         summary[f"ratio_batch_{batch_size}"] = statistics.median(by_name["ours/faster torch"])
     record = {
         "table": "bench_fusion",
-        "title": "Training throughput on one CPU thread, median over turns",
+        "title": "Training throughput on one CPU thread beside PyTorch",
         "preset": "paper",
         **_run.provenance(),
         "core": core,

@@ -78,7 +78,7 @@ def _check(x: Array, y: Array) -> None:
 
 
 def init(
-    key: Key[Array, ""], config: BNNConfig, x: Float[Array, "n i"], y: Float[Array, "n o"]
+    key: Key[Array, ""], config: BNNConfig, x: Float[Array, "n i"], y: Float[Array, "m o"]
 ) -> BNNParams:
     """Initial posterior: small random means, narrow spread, moments of the data."""
     _check(x, y)
@@ -162,7 +162,7 @@ def negative_elbo(
 
 
 def fit(
-    key: Key[Array, ""], config: BNNConfig, x: Float[Array, "n i"], y: Float[Array, "n o"]
+    key: Key[Array, ""], config: BNNConfig, x: Float[Array, "n i"], y: Float[Array, "m o"]
 ) -> tuple[BNNParams, Float[Array, " t"]]:
     """Train the posterior by Adam in one scan.
 
@@ -234,7 +234,7 @@ def _design(x: Array) -> Array:
 
 def fit_linear(
     x: Float[Array, "n i"],
-    y: Float[Array, "n o"],
+    y: Float[Array, "m o"],
     *,
     prior_variance: float = 1.0,
     iterations: Int[Array, ""] | int = 20,

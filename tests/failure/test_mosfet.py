@@ -73,6 +73,8 @@ def test_conductances_are_the_derivatives(
     close = {"rtol": 1e-7, "atol": 1e-12}
     if model == "level1" and abs(vd - vs) < 1e-9:
         return  # |v_ds| has a corner at zero
+    if model == "ekv" and min(abs(polarity * (vg - v) - float(p.vto)) for v in (vd, vs)) < 1e-12:
+        return  # automatic differentiation of max(u, 0) is one-sided at the threshold itself
     np.testing.assert_allclose(gm, by_g, **close)
     np.testing.assert_allclose(gds, by_d, **close)
     np.testing.assert_allclose(-(gm + gds), by_s, **close)

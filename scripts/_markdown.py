@@ -45,7 +45,7 @@ def mark(row: Row) -> str | None:
     return "better" if (mean < source) == lower else "worse"
 
 
-def cell(row: Row | None) -> str:
+def cell(row: Row | None, with_unit: bool = False) -> str:
     """One cell: mean, interval, n, source and mark."""
     if row is None:
         return ""
@@ -54,6 +54,8 @@ def cell(row: Row | None) -> str:
     interval = row.get("ci95")
     if interval is not None:
         text += f" [{number(interval[0], unit)}, {number(interval[1], unit)}]"
+    if with_unit and unit not in ("", "1"):
+        text += f" {unit}"
     if "n" in row:
         text += f" ({row['n']})"
     if "source" in row:
@@ -73,13 +75,16 @@ def distinct(rows: Iterable[Row], field: str) -> list[str]:
     return list(dict.fromkeys(str(row[field]) for row in rows))
 
 
-def pivot(rows: Sequence[Row], down: str, across: str) -> str:
+def pivot(rows: Sequence[Row], down: str, across: str, with_unit: bool = False) -> str:
     """Rows of record as a table of `down` x `across`."""
     held = {(str(row[down]), str(row[across])): row for row in rows}
     columns = distinct(rows, across)
     return grid(
         [down.replace("row", "case"), *columns],
-        ([name, *(cell(held.get((name, c))) for c in columns)] for name in distinct(rows, down)),
+        (
+            [name, *(cell(held.get((name, c)), with_unit) for c in columns)]
+            for name in distinct(rows, down)
+        ),
     )
 
 
@@ -94,13 +99,15 @@ def measured(rows: Sequence[Row], source: Table | None = None) -> str:
     metrics = distinct(rows, "metric")
     cases = distinct(rows, "row")
     if len(cases) == 1 and len(metrics) > 1:
-        return f"{cases[0]}:\n\n" + pivot(rows, "model", "metric")
+        return f"{cases[0]}:\n\n" + pivot(rows, "model", "metric", with_unit=True)
     parts = []
     for metric in metrics:
         chosen = [row for row in rows if row["metric"] == metric]
-        unit = chosen[0].get("unit", "")
-        title = metric.replace("_", " ") + ("" if unit in ("", "1") else f" [{unit}]")
-        parts.append(f"**{title}**\n\n" + pivot(chosen, "row", "model"))
+        units = {row.get("unit", "") for row in chosen}
+        one = units.pop() if len(units) == 1 else ""
+        title = metric.replace("_", " ") + ("" if one in ("", "1") else f" [{one}]")
+        # Cases of one metric may come in units of their own; each cell then names its unit.
+        parts.append(f"**{title}**\n\n" + pivot(chosen, "row", "model", with_unit=not one))
     return "\n\n".join(parts)
 
 

@@ -122,7 +122,7 @@ def test_page(config: render_results.Config) -> None:
         "Command: `python scripts/reproduce.py --table 3.1`; preset paper; commit abc1234" in page
     )
     assert "## A study of steps" in page
-    assert _line(page, "| S4 |").startswith("| S4 | **50.5** (3) | **70.00** (3) |")
+    assert _line(page, "| S4 |").startswith("| S4 | **50.5** steps (3) | **70.00** % (3) |")
 
     readme = config.readme.read_text()
     assert readme.startswith("# top\n<!-- results:begin -->\nAll cells")
@@ -182,6 +182,18 @@ def test_single_runs_give_figure_and_studies(config: render_results.Config) -> N
     _run.write_json(path, held | {"date": "2026-01-03"})
     render_results.main(config)
     assert json.loads(path.read_text())["date"] == "2026-01-03"
+
+
+def test_units_stand_in_the_heading_or_in_the_cells() -> None:
+    rows = [
+        {"row": name, "model": "pBO", "metric": "worst_case", "unit": unit, "mean": 9.4}
+        for name, unit in (("current", "mA"), ("undershoot", "V"))
+    ]
+    assert "**worst case [mA]**" in _markdown.measured(rows[:1])
+    mixed = _markdown.measured(rows)
+    assert "**worst case**\n" in mixed
+    assert "| current | **9.4** mA |" in mixed
+    assert "| undershoot | **9.4** V |" in mixed
 
 
 def test_markers_in_the_wrong_order_are_refused() -> None:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -37,7 +37,7 @@ def init(
     width: int | None = None,
     step: float = 0.25,
     scale: float = 0.5,
-    dtype: jnp.dtype | None = None,
+    dtype: Any = None,
 ) -> RevNetParams:
     """Random weights, small enough that the map starts near the identity.
 

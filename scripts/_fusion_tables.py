@@ -202,6 +202,8 @@ def collect(
         (rows in the schema of record, paired comparisons between neighbouring models and gap
         closures to the oracle gate).
     """
+    import numpy as np
+
     from fusion import evaluate
 
     held = load_runs(table, out, seeds)
@@ -237,7 +239,7 @@ def collect(
             common = sorted(set(three[0]) & set(three[1]) & set(three[2]))
             if common:
                 values = [[t[s]["accuracy"] for s in common] for t in three]
-                gap = evaluate.gap_closure(*values)
+                gap = evaluate.gap_closure(*(np.asarray(v) for v in values))
                 studies.append(
                     {
                         "row": row,

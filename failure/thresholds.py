@@ -41,7 +41,8 @@ def reachable(
 
     .. math:: T = y(0) + \rho\,(y_{worst} - y(0))
 
-    Adam on the feasible set, its rate falling linearly; samples that do not converge are ignored.
+    Adam in a box, normalised gradients with momentum in a ball; the rate falls linearly; samples
+    that do not converge are ignored.
     This is not a search method: it costs thousands of simulations with gradients, and serves to
     set a threshold that is known to be reachable.
 
@@ -85,7 +86,14 @@ def reachable(
             best_y = jnp.where(better, y, best_y)
             m, v = 0.9 * m + 0.1 * g, 0.99 * v + 0.01 * g * g
             scale = rate * size * (1.0 - t / steps)
-            move = m / (1.0 - 0.9 ** (t + 1.0)) / (jnp.sqrt(v / (1.0 - 0.99 ** (t + 1.0))) + 1e-12)
+            if task.kind == "box":
+                first, second = m / (1.0 - 0.9 ** (t + 1.0)), v / (1.0 - 0.99 ** (t + 1.0))
+                move = first / (jnp.sqrt(second) + 1e-12)
+            else:
+                # Steps of equal size per coordinate would come to rest on the sphere where x is
+                # parallel to the gradient's signs; the gradient's own direction is wanted.
+                length = jnp.linalg.norm(m, axis=1, keepdims=True)
+                move = m * (task.dim**0.5 / (length + 1e-300**0.5))
             x = jax.vmap(project, (None, 0))(domain, x + scale * move)
             return (x, m, v, best_x, best_y), y
 

@@ -1,1 +1,1 @@
-"""Car detection from camera and lidar on KITTI: files, geometry, maps, boxes, evaluation."""
+"""Car detection from camera and lidar on KITTI: files, geometry, ground planes, evaluation."""

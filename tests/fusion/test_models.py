@@ -30,6 +30,7 @@ SMALL = ModelConfig(
     encoder=EncoderConfig(features=8, frequencies=4),
     gate_width=8,
     head_widths=(24,),
+    embrace_width=12,
 )
 X = jax.random.uniform(jax.random.key(9), (7, 3, 1), minval=-1.0)
 FAILED = jnp.zeros((7, 3), bool).at[:, 0].set(True)

@@ -15,10 +15,12 @@ from failure import (
     embeddings,
     gp,
     gp_fit,
+    optimize,
     rare_events,
     revnet,
     runs,
     simulators,
+    thresholds,
     turbo,
 )
 from failure.bayesopt import SearchConfig, ask, tell
@@ -40,11 +42,13 @@ __all__ = [
     "gp_fit",
     "importance_sampling",
     "monte_carlo",
+    "optimize",
     "rare_events",
     "revnet",
     "runs",
     "simulators",
     "subset_simulation",
     "tell",
+    "thresholds",
     "turbo",
 ]

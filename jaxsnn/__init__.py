@@ -1,9 +1,9 @@
 """Spiking networks that learn to steer a robot by reward-modulated STDP, and the robot's world.
 
 Kernels: `neurons`, `plasticity`, `window`. Network: `encoding`, `rewards`, `architecture`,
-`network`, `settings`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`. Together: `agents`,
-`trials`, `qlearning`. Imported by name only, for what they bring along: `jaxsnn.ppo` (flax, optax),
-`jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
+`network`, `settings`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`. All together:
+`agents`, `trials`, `qlearning`. Imported by name only, for what they bring along: `jaxsnn.ppo`
+(flax, optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
 """
 
 from jaxsnn import (

@@ -1,6 +1,6 @@
 """Cost of one Bayesian-optimisation iteration: this package against BoTorch, at equal quality.
 
-    taskset -c 0 python scripts/bench_bo.py --out /tmp/bench_bo
+    taskset -c 0 python scripts/bench_bo.py --out runs/bench_bo
 
 Needs the `bench` extra (torch, botorch). Both sides get the same data (n = 300 points, half of
 them uniform, half around the best, as a search leaves them), the same kernel (Matern-5/2 with one

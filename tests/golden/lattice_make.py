@@ -2,11 +2,11 @@
 
 Run in an environment of its own, not in the project's:
 
-    python -m venv /tmp/lattice-peers
-    /tmp/lattice-peers/bin/pip install tensorflow==2.21.0 tf_keras==2.21.0 tensorflow-lattice==2.1.1
-    /tmp/lattice-peers/bin/pip install torch==2.13.0 pydantic pandas tqdm matplotlib
-    /tmp/lattice-peers/bin/pip install --no-deps pytorch-lattice==0.2.0
-    TF_USE_LEGACY_KERAS=1 /tmp/lattice-peers/bin/python tests/golden/lattice_make.py
+    python -m venv .lattice-peers
+    .lattice-peers/bin/pip install tensorflow==2.21.0 tf_keras==2.21.0 tensorflow-lattice==2.1.1
+    .lattice-peers/bin/pip install torch==2.13.0 pydantic pandas tqdm matplotlib
+    .lattice-peers/bin/pip install --no-deps pytorch-lattice==0.2.0
+    TF_USE_LEGACY_KERAS=1 .lattice-peers/bin/python tests/golden/lattice_make.py
 
 About one minute. Weights and inputs are random with a fixed seed, rounded to float32 and stored
 with the outputs; the libraries compute in float64 where they can. Keys are `<case>.<name>`;

@@ -22,8 +22,8 @@ class Preset(NamedTuple):
     hyper: HyperParams
 
 
-# Chosen on validation splits (four held-out subjects; held-out rows), never on a test set:
-# docs/argate.md tells which settings were compared and results/study_argate.json holds the numbers.
+# Chosen on validation splits (held-out subjects; held-out rows), never on a test set, in short
+# explorations of one seed; `scripts/study_argate.py` is the whole study, see docs/argate.md.
 _HAR = Preset(
     ModelConfig(head_widths=(128,), dropout=0.2),
     TrainConfig(epochs=15, batch_size=64, uniform_floor=1.0, label_smoothing=0.05),

@@ -143,7 +143,7 @@ def main(config: Config) -> dict[str, Any]:
     import jax
     import numpy as np
 
-    from fusion import evaluate, plots
+    from fusion import plots
     from fusion.data import load, validation_split
     from fusion.fit import fit, test_output
     from fusion.models import count_parameters
@@ -207,14 +207,13 @@ def main(config: Config) -> dict[str, Any]:
         pictures["gate.png"] = plots.plot_gate(output.weights, output.failed, dataset.channels)
     for file, figure in pictures.items():
         figure.savefig(out / file, dpi=120)
-    parts = evaluate.split_accuracy(output.labels, output.logits.argmax(-1), output.failed)
     print(f"{len(output.labels)} {summary['rows']} examples; pictures and result.json in {out}")
     _run.print_result(
         dataset=config.dataset,
         model=config.model,
         accuracy=summary["accuracy"],
-        clean=100.0 * parts.clean,
-        corrupted=100.0 * parts.corrupted,
+        clean=summary["accuracy_clean"],
+        corrupted=summary["accuracy_corrupted"],
         gate_auroc=summary["gate_auroc_pooled"],
     )
     return summary

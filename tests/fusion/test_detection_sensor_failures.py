@@ -1,0 +1,160 @@
+"""Failures of camera and lidar: physics by hand, untouched at severity 0, jit and vmap."""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fusion.detection.hdl64 import ELEVATIONS, beam_of
+from fusion.detection.sensor_failures import (
+    CAMERA_FAILURES,
+    LIDAR_FAILURES,
+    camera_failure,
+    lidar_failure,
+    random_camera_failure,
+    random_lidar_failure,
+)
+
+KEY = jax.random.key(3)
+camera = jax.jit(camera_failure, static_argnames="kind")
+lidar = jax.jit(lidar_failure, static_argnames="kind")
+
+
+@pytest.fixture(scope="module")
+def image() -> jax.Array:
+    return jax.random.uniform(jax.random.key(0), (24, 64, 3), minval=0.05, maxval=0.95)
+
+
+@pytest.fixture(scope="module")
+def scan() -> tuple[jax.Array, jax.Array]:
+    """A wall 20 m away all around, 64 beams by 90 azimuths, and 40 rows of padding."""
+    azimuth, elevation = np.meshgrid(np.radians(np.arange(-180, 180, 4)), ELEVATIONS)
+    unit = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1).reshape(-1, 3)
+    points = np.concatenate([20 * unit, np.full((len(unit), 1), 0.3)], axis=1)
+    padded = np.concatenate([points, np.zeros((40, 4))]).astype(np.float32)
+    return jnp.asarray(padded), jnp.arange(len(padded)) < len(points)
+
+
+def test_severity_zero_changes_nothing(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
+    for kind in CAMERA_FAILURES:
+        np.testing.assert_array_equal(camera(KEY, image, kind, jnp.float32(0)), image)
+    for kind in LIDAR_FAILURES:
+        points, mask = lidar(KEY, *scan, kind, jnp.float32(0))
+        np.testing.assert_array_equal(points, scan[0])
+        np.testing.assert_array_equal(mask, scan[1])
+
+
+def test_more_severity_leaves_less(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
+    for kind in CAMERA_FAILURES:
+        out = [camera(KEY, image, kind, jnp.float32(s)) for s in (0.3, 1.0)]
+        assert all(float(o.min()) >= 0 and float(o.max()) <= 1 for o in out)
+        change = [float(jnp.abs(o - image).mean()) for o in out]
+        assert change[0] > 0.02 and change[1] >= change[0]
+    kept = {
+        kind: [int(lidar(KEY, *scan, kind, jnp.float32(s))[1].sum()) for s in (0.3, 1.0)]
+        for kind in LIDAR_FAILURES
+    }
+    n = int(scan[1].sum())
+    assert kept["noise"] == [n, n] and kept["loss"] == [0, 0]
+    assert n > kept["beam_loss"][0] > kept["beam_loss"][1] > 0
+    assert n > kept["sector_dropout"][0] > kept["sector_dropout"][1] > 0.8 * n
+
+
+def test_fog_follows_koschmieder(image: jax.Array) -> None:
+    depth = jnp.full(image.shape[:2], 25.0).at[0].set(jnp.inf).at[1].set(0.0)
+    out = camera(KEY, image, "fog", jnp.float32(1), depth=depth)
+    np.testing.assert_allclose(out[0], 0.8, atol=1e-6)  # sky: airlight alone
+    np.testing.assert_allclose(out[1], image[1], atol=1e-6)
+    # At the visibility 5 % of the contrast is left.
+    np.testing.assert_allclose(out[2:], 0.05 * image[2:] + 0.95 * 0.8, atol=1e-5)
+    constant = camera(KEY, image, "fog", jnp.float32(0.5))
+    through = 0.05 ** (0.5 * 30 / 25)
+    np.testing.assert_allclose(constant, through * image + (1 - through) * 0.8, atol=1e-5)
+
+
+def test_exposure_gains_then_saturates(image: jax.Array) -> None:
+    out = [camera(jax.random.key(i), image, "exposure", jnp.float32(0.4)) for i in range(8)]
+    bright = [o for o in out if float(o.mean()) > float(image.mean())]
+    dark = [o for o in out if float(o.mean()) < float(image.mean())]
+    assert bright and dark
+    gain = 2 ** (2 / 2.2)  # two stops
+    np.testing.assert_allclose(bright[0], np.minimum(gain * image, 1.0), rtol=1e-4)
+    np.testing.assert_allclose(dark[0], image / gain, rtol=1e-4)
+
+
+def test_blur_is_a_gaussian_mean(image: jax.Array) -> None:
+    flat = jnp.full((9, 64, 3), 0.4)
+    np.testing.assert_allclose(camera(KEY, flat, "blur", jnp.float32(1)), 0.4, rtol=1e-5)
+    point = jnp.zeros((25, 64, 3)).at[12, 32].set(1.0)
+    spread = np.asarray(camera(KEY, point, "blur", jnp.float32(1)))[:, :, 0]
+    assert spread.sum() == pytest.approx(1.0, abs=1e-4)
+    sd = 0.02 * 64
+    offset = np.arange(-2, 3)
+    np.testing.assert_allclose(
+        spread[12, 30:35] / spread[12, 32], np.exp(-0.5 * (offset / sd) ** 2), rtol=1e-4
+    )
+
+
+def test_camera_noise_has_the_stated_variance() -> None:
+    # Little enough that clipping at 0 and 1 does not matter.
+    grey = jnp.full((100, 100, 3), 0.5)
+    sd = float((camera(KEY, grey, "noise", jnp.float32(0.2)) - grey).std())
+    assert sd == pytest.approx(0.2 * np.sqrt(0.4**2 + 0.1 * 0.5), rel=0.02)
+
+
+def test_range_noise_stays_on_the_beam(scan: tuple[jax.Array, jax.Array]) -> None:
+    clean, mask = scan
+    n = int(mask.sum())
+    points, _ = lidar(KEY, clean, mask, "noise", jnp.float32(0.5))
+    before, after = np.asarray(clean)[:n, :3], np.asarray(points)[:n, :3]
+    r0, r1 = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
+    np.testing.assert_allclose(after / r1[:, None], before / r0[:, None], atol=1e-5)
+    assert (r1 - r0).std() == pytest.approx(0.5, rel=0.05)
+    assert float(points[n:].max()) == 0.0 == float(jnp.abs(points[n:]).max())
+
+
+def test_lost_beams_are_rings_and_lost_sectors_are_azimuths(
+    scan: tuple[jax.Array, jax.Array],
+) -> None:
+    clean, mask = scan
+    n = int(mask.sum())
+    beam = np.repeat(np.arange(64), 90)
+    np.testing.assert_array_equal(beam_of(clean)[:n], beam)
+    points, kept = lidar(KEY, clean, mask, "beam_loss", jnp.float32(0.25))
+    per_beam = np.asarray(kept)[:n].reshape(64, 90).sum(axis=1)
+    assert set(per_beam.tolist()) == {0, 90} and (per_beam == 0).sum() == 16
+    assert float(jnp.abs(points[~kept]).max()) == 0.0  # what is lost cannot be read
+    _, kept = lidar(KEY, clean, mask, "beam_loss", jnp.float32(1))
+    assert int(kept.sum()) == 4 * 90
+
+    _, kept = lidar(KEY, clean, mask, "sector_dropout", jnp.float32(1))
+    gone = ~np.asarray(kept)[:n].reshape(64, 90)
+    assert (gone == gone[0]).all() and gone[0].sum() in (14, 15, 16)  # 60 of 360 degrees
+    azimuth = np.arange(-180, 180, 4)[gone[0]]
+    assert np.ptp(azimuth) <= 60 and abs(azimuth.mean()) <= 42
+
+
+def test_drawn_kind_under_vmap(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
+    keys = jax.random.split(KEY, 12)
+    pair = ("blackout", "fog")
+    out = jax.jit(jax.vmap(lambda k: random_camera_failure(k, image, kinds=pair)))(keys)
+    dark = np.asarray(out).max(axis=(1, 2, 3)) == 0.0
+    assert 0 < dark.sum() < 12
+    through = 0.05 ** (30 / 25)
+    fog = through * np.asarray(image) + (1 - through) * 0.8
+    np.testing.assert_allclose(out[~dark], np.broadcast_to(fog, out[~dark].shape), atol=1e-5)
+    draw = jax.vmap(lambda k: random_lidar_failure(k, *scan, kinds=("loss", "beam_loss"))[1].sum())
+    assert set(jax.jit(draw)(keys).tolist()) == {0, 4 * 90}
+
+
+def test_bad_input_is_named(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
+    with pytest.raises(ValueError, match="camera failure 'rain': expected one of noise, blackout"):
+        camera_failure(KEY, image, "rain")
+    with pytest.raises(ValueError, match="lidar failure 'fog': expected one of noise, beam_loss"):
+        lidar_failure(KEY, *scan, "fog")
+    with pytest.raises(ValueError, match=r"severity is 1\.5, expected a number from 0"):
+        camera_failure(KEY, image, "noise", 1.5)
+    with pytest.raises(ValueError, match="lidar failure none given"):
+        random_lidar_failure(KEY, *scan, kinds=())

@@ -168,23 +168,15 @@ def provenance() -> dict[str, Any]:
     }
 
 
-# Two-sided 95 % points of Student's t for 1..30 degrees of freedom, then the normal's.
-_T95 = (
-    12.706, 4.303, 3.182, 2.776, 2.571, 2.447, 2.365, 2.306, 2.262, 2.228,
-    2.201, 2.179, 2.160, 2.145, 2.131, 2.120, 2.110, 2.101, 2.093, 2.086,
-    2.080, 2.074, 2.069, 2.064, 2.060, 2.056, 2.052, 2.048, 2.045, 2.042,
-)  # fmt: skip
-
-
 def summarize(values: Sequence[float]) -> dict[str, Any]:
     """`n`, `mean`, `ci95` (Student's t interval of the mean) and the `values` themselves."""
-    n = len(values)
-    mean = sum(values) / n
-    if n == 1:
-        return {"n": 1, "mean": mean, "ci95": None, "values": list(values)}
-    sd = math.sqrt(sum((v - mean) ** 2 for v in values) / (n - 1))
-    half = (_T95[n - 2] if n <= 31 else 1.96) * sd / math.sqrt(n)
-    return {"n": n, "mean": mean, "ci95": [mean - half, mean + half], "values": list(values)}
+    from fusion.evaluate import mean_interval
+
+    values = list(values)
+    if len(values) == 1:
+        return {"n": 1, "mean": values[0], "ci95": None, "values": values}
+    found = mean_interval(values)
+    return {"n": len(values), "mean": found.mean, "ci95": [found.low, found.high], "values": values}
 
 
 def record_table(

@@ -72,6 +72,8 @@ class Config:
     """Simulations per search."""
     radius: float = 6.0
     """Radius of the ball [sigma]."""
+    retrain_every: int = 100
+    """Simulations between trainings of a Rev-ARGate; the first is on the 50 initial ones."""
     probability: bool = True
     """Estimate the failure probability at each threshold."""
     out: Path = Path("runs/study_failures")
@@ -207,6 +209,7 @@ def main(config: Config) -> dict[str, Any]:
                         method,
                         seeds=tuple(range(config.seeds)),
                         n_total=config.n_total,
+                        retrain_every=config.retrain_every,
                         embedding_dim=EMBEDDING_DIM.get(config.circuit),
                     )
                     started = time.process_time()

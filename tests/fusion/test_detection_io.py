@@ -28,10 +28,12 @@ from fusion.detection.io import (
     read_results,
     read_split,
     write_calibration,
+    write_image,
     write_labels,
     write_plane,
     write_points,
     write_results,
+    write_split,
 )
 from fusion.detection.objects import Objects, concatenate, empty, select
 
@@ -181,8 +183,10 @@ def test_images(tmp_path: Path) -> None:
 
     path = tmp_path / "000000.png"
     picture = np.random.default_rng(0).integers(0, 255, (370, 1224, 3)).astype(np.uint8)
-    Image.fromarray(picture).save(path)
+    write_image(path, picture)
     np.testing.assert_array_equal(read_image(path), picture)
+    with pytest.raises(ValueError, match=r"image is float64 \(370, 1224, 3\), expected uint8"):
+        write_image(path, picture / 255.0)
     Image.fromarray(picture[:100]).save(path)
     with pytest.raises(ValueError, match="1224x100 pixels, expected 1224x370 to 1242x376"):
         read_image(path)
@@ -211,7 +215,7 @@ def test_planes_and_splits(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match="line 2: 3 values, expected 4"):
         read_plane(path)
 
-    path.write_text("000003\n000001\n")
+    write_split(path, ("000003", "000001"))
     assert read_split(path) == ("000003", "000001")
     for text, message in (
         ("000003\n3\n", "line 2: '3', expected six digits"),

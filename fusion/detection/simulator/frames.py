@@ -1,0 +1,171 @@
+"""Simulated frames as a KITTI folder, and the draws that make frame i the same in every run.
+
+OUT/training/{image_2,velodyne,calib,label_2,planes}/000000.*
+OUT/training/visibility/000000.csv        what each sensor saw of each object
+OUT/ImageSets/{train,val,test}.txt
+"""
+
+from __future__ import annotations
+
+import csv
+import dataclasses
+from collections.abc import Iterator, Sequence
+from pathlib import Path
+
+import jax
+import numpy as np
+
+from fusion.detection.calibration import Calibration
+from fusion.detection.io import (
+    write_calibration,
+    write_image,
+    write_labels,
+    write_plane,
+    write_points,
+)
+from fusion.detection.simulator.labels import Visibility, labels_of, visibility_of
+from fusion.detection.simulator.layouts import Layout, compose, generated_layout
+from fusion.detection.simulator.scene import Scene, SceneConfig, build_scene
+from fusion.detection.simulator.sensors import (
+    Readings,
+    SensorConfig,
+    nominal_calibration,
+    rays,
+    render,
+)
+
+__all__ = ["SimulatedFrame", "draw_scene", "simulate_frames", "split_layouts", "write_frame"]
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class SimulatedFrame:
+    """One frame: scene and readings with numpy leaves, what is visible, night or day."""
+
+    index: int
+    scene: Scene
+    readings: Readings
+    seen: Visibility
+    night: bool
+
+
+def split_layouts(
+    layouts: Sequence[Layout], counts: Sequence[int], seed: int
+) -> list[list[Layout]]:
+    """Share layouts out in proportion to `counts`, so that no two parts hold the same one.
+
+    Raises:
+        ValueError: fewer layouts than parts.
+    """
+    wanted = [i for i, n in enumerate(counts) if n]
+    if len(layouts) < len(wanted):
+        raise ValueError(
+            f"{len(layouts)} layouts, expected at least {len(wanted)}: train, val and test must "
+            "not share any"
+        )
+    order = np.random.default_rng([seed, 1]).permutation(len(layouts))
+    spare = len(layouts) - len(wanted)
+    total = sum(counts)
+    parts: list[list[Layout]] = [[] for _ in counts]
+    start = 0
+    for done, i in enumerate(wanted):
+        last = done == len(wanted) - 1
+        size = 1 + (spare * counts[i]) // total
+        stop = len(layouts) if last else start + size
+        parts[i] = [layouts[k] for k in order[start:stop]]
+        start = stop
+    return parts
+
+
+def draw_scene(
+    index: int, position: int, pool: Sequence[Layout], config: SceneConfig, seed: int
+) -> tuple[Scene, int]:
+    """The scene of frame `index`, and how many objects and look-alikes it has.
+
+    Args:
+        index: of the frame, over all parts.
+        position: of the frame in its part; layouts are taken in turn.
+        pool: layouts of its part; empty: from the fitted model.
+        config: scene options.
+        seed: of the data set.
+    """
+    rng = np.random.default_rng([seed, 2, index])
+    if pool:
+        base, other = pool[position % len(pool)], pool[int(rng.integers(len(pool)))]
+    else:
+        base, other = generated_layout(rng), generated_layout(rng)
+    layout = compose(
+        rng,
+        base,
+        other,
+        max_objects=config.max_objects,
+        max_look_alikes=config.max_look_alikes,
+    )
+    return build_scene(rng, layout, config), len(layout)
+
+
+def simulate_frames(
+    frames: Sequence[tuple[int, int, Sequence[Layout]]],
+    scene_config: SceneConfig,
+    sensor_config: SensorConfig,
+    seed: int,
+    *,
+    chunk: int = 8,
+    batch_size: int | None = None,
+) -> Iterator[SimulatedFrame]:
+    """Draw and render frames given as (index, position in its part, layouts of its part).
+
+    A frame depends on seed and index alone, not on the chunks. `batch_size` is that of `render`.
+    """
+    beams = rays(nominal_calibration(sensor_config.scale), sensor_config)
+    root = jax.random.key(seed)
+    for start in range(0, len(frames), chunk):
+        part = list(frames[start : start + chunk])
+        padded = part + [part[-1]] * (chunk - len(part))  # one program for all chunks
+        drawn = [draw_scene(i, k, pool, scene_config, seed) for i, k, pool in padded]
+        scenes = jax.tree.map(lambda *leaves: np.stack(leaves), *[scene for scene, _ in drawn])
+        keys = jax.vmap(lambda i: jax.random.fold_in(root, i))(
+            np.array([i for i, _, _ in padded], np.uint32)
+        )
+        read = jax.device_get(render(scenes, beams, keys, sensor_config, batch_size=batch_size))
+        for n, (index, _, _) in enumerate(part):
+            scene, n_things = drawn[n]
+            readings = Readings(*(leaf[n] for leaf in read))
+            seen = visibility_of(scene, readings, n_things)
+            yield SimulatedFrame(index, scene, readings, seen, bool(scene.light[1] < 0.5))
+
+
+def write_frame(folder: Path, frame: SimulatedFrame, calibration: Calibration) -> dict[str, int]:
+    """Write the files of one frame below `folder` (`OUT/training`), the labels last.
+
+    Returns:
+        Counts of points, labelled objects, cars and look-alikes.
+    """
+    name = f"{frame.index:06d}"
+    readings, seen = frame.readings, frame.seen
+    image = np.round(255 * np.asarray(readings.image)).astype(np.uint8)
+    points = np.asarray(readings.points)[np.asarray(readings.mask)]
+    write_image(folder / "image_2" / f"{name}.png", image)
+    write_points(folder / "velodyne" / f"{name}.bin", points)
+    write_calibration(folder / "calib" / f"{name}.txt", calibration)
+    write_plane(folder / "planes" / f"{name}.txt", np.asarray(frame.scene.plane))
+    table = folder / "visibility" / f"{name}.csv"
+    table.parent.mkdir(parents=True, exist_ok=True)
+    with table.open("w", encoding="ascii", newline="") as file:
+        rows = csv.writer(file)
+        rows.writerow(
+            ["label", "kind", "points", "pixels", "share", "dark_paint", "low_contrast", "night"]
+        )
+        for i in range(len(seen.slot)):
+            rows.writerow(
+                [int(seen.label[i]), seen.kind[i], int(seen.points[i]), f"{seen.pixels[i]:.2f}",
+                 f"{seen.share[i]:.3f}", int(seen.dark_paint[i]), int(seen.low_contrast[i]),
+                 int(frame.night)]
+            )  # fmt: skip
+    labels = labels_of(frame.scene, seen, calibration, *image.shape[:2])
+    write_labels(folder / "label_2" / f"{name}.txt", labels)
+    return {
+        "points": len(points),
+        "objects": len(labels),
+        "cars": int((labels.type == "Car").sum()),
+        "look_alikes": int(np.isin(seen.kind, ("bush", "container")).sum()),
+    }

@@ -89,6 +89,12 @@ class Config:
     """i/n: run part i (from 0) of n parts and nothing else."""
     distributed: bool = False
     """This is one process of a jax.distributed run (see docs/sweeps.md)."""
+    coordinator: str | None = None
+    """host:port of process 0; found by itself under SLURM and on TPU pods, as the next two are."""
+    processes: int | None = None
+    """Processes of the distributed run."""
+    process: int | None = None
+    """Number of this one, from 0."""
     ray_address: str | None = None
     """A running Ray cluster; without it Ray is started on this machine."""
     gpus_per_worker: float = 0.0
@@ -270,7 +276,9 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     if config.distributed:
-        jax.distributed.initialize()
+        if config.shard or config.workers > 1 or config.launcher != "local":
+            raise ValueError("--distributed is one program; leave --shard and --workers out")
+        jax.distributed.initialize(config.coordinator, config.processes, config.process)
     if config.shard:
         parse_shard(config.shard)
         if config.workers > 1 or config.launcher != "local":

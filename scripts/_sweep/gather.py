@@ -106,7 +106,7 @@ def is_complete(sweep: Sweep) -> bool:
 
 
 def write_netcdf(dataset: Any, path: Path) -> None:
-    """Write a data set as netCDF 3 (64-bit offsets), which every reader knows, whole or not at all."""
+    """Write a data set as netCDF 3 (64-bit offsets), which every reader knows, atomically."""
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     os.close(handle)
     try:

@@ -6,11 +6,16 @@ from collections.abc import Callable
 
 from failure.circuits.dcdc import make_dcdc
 from failure.circuits.ldo import make_ldo
+from failure.circuits.pfm import make_dcdc_light
 from failure.circuits.protocol import Circuit, Spec
 
-__all__ = ["CIRCUITS", "Circuit", "Spec", "get", "make_dcdc", "make_ldo"]
+__all__ = ["CIRCUITS", "Circuit", "Spec", "get", "make_dcdc", "make_dcdc_light", "make_ldo"]
 
-CIRCUITS: dict[str, Callable[[], Circuit]] = {"dcdc": make_dcdc, "ldo": make_ldo}
+CIRCUITS: dict[str, Callable[[], Circuit]] = {
+    "dcdc": make_dcdc,
+    "dcdc_light": make_dcdc_light,
+    "ldo": make_ldo,
+}
 """Name -> function that makes the circuit."""
 
 

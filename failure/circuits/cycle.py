@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["Stage", "expm", "pwm_cycle", "stage_matrix"]
+__all__ = ["Stage", "expm", "pwm_cycle", "stage_matrix", "until", "walk"]
 
 _SQUARINGS = 6
 _TERMS = 8
@@ -114,6 +114,68 @@ def stage_matrix(
     return jnp.stack([coil, cap, zero_row, out, jnp.zeros_like(out)]), out, comp
 
 
+def walk(
+    x: Float[Array, "n b"],
+    a: Float[Array, "n n b"],
+    row: Float[Array, "n b"],
+    length: Float[Array, "b"],
+    points: int,
+) -> tuple[Float[Array, "n b"], Float[Array, "b"]]:
+    """Move the state over a segment and find the largest output on the way.
+
+    Args:
+        x: state at the start.
+        a: generator of the segment.
+        row: reads the output.
+        length: of the segment [s].
+        points: samples of the output; between two of them the vertex of a parabola counts.
+    Returns:
+        (state at the end, largest output).
+    """
+    step = expm(a * (length / points)[None, None])
+    peak = jnp.sum(row * x, axis=0)
+    for _ in range(points):
+        new = _apply(step, x)
+        v0, v1 = jnp.sum(row * x, axis=0), jnp.sum(row * new, axis=0)
+        h = length / points
+        s0 = jnp.sum(row * _apply(a, x), axis=0) * h
+        s1 = jnp.sum(row * _apply(a, new), axis=0) * h
+        # Vertex of the parabola with these end slopes, where it lies inside the step.
+        inside = (s0 > 0.0) & (s1 < 0.0)
+        at = s0 / jnp.where(inside, s0 - s1, 1.0)
+        vertex = v0 + 0.5 * s0 * at
+        peak = jnp.maximum(peak, jnp.maximum(v1, jnp.where(inside, vertex, v1)))
+        x = new
+    return x, peak
+
+
+def until(
+    x: Float[Array, "n b"],
+    a: Float[Array, "n n b"],
+    row: Float[Array, "n b"],
+    t_guess: Float[Array, "b"],
+    *,
+    iterations: int = 4,
+) -> Float[Array, "b"]:
+    """Time at which `row` times the state passes zero, by Newton on the exact trajectory.
+
+    Args:
+        x: state at the start.
+        a: generator.
+        row: what passes zero; falling or rising steadily.
+        t_guess: start [s].
+        iterations: Newton steps.
+    Returns:
+        Time [s], not below zero.
+    """
+    t = t_guess
+    for _ in range(iterations):
+        here = _apply(expm(a * t[None, None]), x)
+        rate = jnp.sum(row * _apply(a, here), axis=0)
+        t = jnp.maximum(t - jnp.sum(row * here, axis=0) / rate, 0.0)
+    return t
+
+
 def pwm_cycle(
     x: Float[Array, "5 b"],
     t_guess: Float[Array, "b"],
@@ -157,23 +219,6 @@ def pwm_cycle(
         t = jnp.clip(t - gap / jnp.minimum(rate, -0.2 * ramp_slope), least, most)
     rise = jnp.clip(t + delay, least, most)
 
-    def walk(x: Array, a: Array, row: Array, length: Array) -> tuple[Array, Array]:
-        step = expm(a * (length / points)[None, None])
-        peak = jnp.sum(row * x, axis=0)
-        for _ in range(points):
-            new = _apply(step, x)
-            v0, v1 = jnp.sum(row * x, axis=0), jnp.sum(row * new, axis=0)
-            h = length / points
-            s0 = jnp.sum(row * _apply(a, x), axis=0) * h
-            s1 = jnp.sum(row * _apply(a, new), axis=0) * h
-            # Vertex of the parabola with these end slopes, where it lies inside the step.
-            inside = (s0 > 0.0) & (s1 < 0.0)
-            at = s0 / jnp.where(inside, s0 - s1, 1.0)
-            vertex = v0 + 0.5 * s0 * at
-            peak = jnp.maximum(peak, jnp.maximum(v1, jnp.where(inside, vertex, v1)))
-            x = new
-        return x, peak
-
-    x, first = walk(x, a_low, out_low, rise)
-    x, second = walk(x, a_high, out_high, period - rise)
+    x, first = walk(x, a_low, out_low, rise, points)
+    x, second = walk(x, a_high, out_high, period - rise, points)
     return x, jax.lax.stop_gradient(t), jnp.maximum(first, second)

@@ -26,7 +26,17 @@ from failure.circuits.protocol import Circuit, Spec, in_chunks
 from failure.circuits.solve import Grid, dc, grid, transient
 from failure.circuits.system import System, compile_netlist
 
-__all__ = ["I_HEAVY", "I_LIGHT", "NETLIST", "QUANTITIES", "SPECS", "TIME", "make_ldo", "solve_ldo"]
+__all__ = [
+    "I_HEAVY",
+    "I_LIGHT",
+    "NETLIST",
+    "QUANTITIES",
+    "SPECS",
+    "TIME",
+    "make_ldo",
+    "solve_ldo",
+    "time_grid",
+]
 
 KNEE = 1.0
 """Voltage scale of the load [V]: it draws `amps * tanh(v / KNEE)`, less as the output falls."""
@@ -37,6 +47,9 @@ I_HEAVY = 150e-3 / math.tanh(1.0 / KNEE)
 
 T_STEP, T_RISE, T_END = 10e-9, 1e-9, 120e-9
 """Start and length of the load step, end of the transient [s]."""
+
+T_DAMPED = 40e-9
+"""From here on the steps of the shipped grid are longer than 4 ns [s]."""
 
 QUANTITIES = (("length", "relative", 0.01), ("vth", "V", 5e-3), ("tox", "relative", 0.007))
 """Varied quantities of each transistor: name, unit of sigma, sigma."""
@@ -91,12 +104,23 @@ NETLIST = Netlist(
     ),
 )
 
-TIME: Grid = grid(
-    (0.0, T_STEP, 1, 1.0),
-    (T_STEP, T_STEP + T_RISE, 8, 1.0),
-    (T_STEP + T_RISE, 14e-9, 24, 2.0),
-    (14e-9, T_END, 20, 20.0),
-)
+
+def time_grid(refine: int = 1) -> Grid:
+    """Grid of the transient; `refine` divides every step.
+
+    From `T_DAMPED` on the steps are backward Euler: some samples ring, and the trapezoidal rule
+    turns a ringing that the long last steps cannot follow into a growing one.
+    """
+    joined = grid(
+        (0.0, T_STEP, 1, 1.0),
+        (T_STEP, T_STEP + T_RISE, 8 * refine, 1.0),
+        (T_STEP + T_RISE, 14e-9, 24 * refine, 2.0),
+        (14e-9, T_END, 20 * refine, 20.0),
+    )
+    return joined._replace(euler=joined.t[1:] > T_DAMPED)
+
+
+TIME: Grid = time_grid()
 """Grid of the transient: finest in the load step and in the dip after it."""
 
 

@@ -331,7 +331,8 @@ def transient(
             entries[row, row] = -alpha * henries
             const[row] = alpha * henries * v[row] + beta * drop
         s = assemble(system, here, entries, const, known, batch)
-        guess = v + slope * ratio
+        # No farther than one Newton step may go: ringing would be extrapolated out of the supplies.
+        guess = v + jnp.clip(slope * ratio, -MAX_STEP, MAX_STEP)
         new, last = newton(system, max_iterations, PLAIN, jax.lax.stop_gradient(guess), s)
         q = charge(jnp.concatenate([new, known]))
         i = alpha * (q - q_old) - beta * i_old

@@ -28,6 +28,8 @@ class Config:
     split: Path | None = None
     """List of the frames to evaluate (`ImageSets/val.txt`)."""
     classes: tuple[str, ...] = ("Car", "Pedestrian", "Cyclist")
+    min_height: tuple[float, float, float] = (40.0, 25.0, 25.0)
+    """Smallest 2D height at each difficulty [pixel]; see `simulation.json` of a simulated set."""
     out: Path | None = None
     """Write the numbers to this JSON file as well."""
 
@@ -58,7 +60,7 @@ def main(config: Config) -> dict[str, Any]:
         raise ValueError(f"{config.detections} holds no detection file such as 000001.txt")
     labels = [read_labels(config.labels / f"{name}.txt") for name in names]
     detections = [read_results(config.detections / f"{name}.txt") for name in names]
-    result = evaluate(labels, detections, classes=config.classes)
+    result = evaluate(labels, detections, classes=config.classes, min_height=config.min_height)
     rows = []
     for points in (11, 40):
         print(f"{'AP R' + str(points) + ' [%]':<24}{'easy':>8}{'moderate':>10}{'hard':>8}")

@@ -33,6 +33,7 @@ from fusion.detection.overlaps import box3d_iou, ground_iou, image_iou
 __all__ = [
     "DIFFICULTIES",
     "METRICS",
+    "MIN_HEIGHT",
     "MIN_OVERLAP",
     "Evaluation",
     "average_precision_cap",
@@ -271,20 +272,20 @@ def _curves(
     return _from_right(precision), _from_right(similarity)
 
 
-def _truth_state(labels: Objects, name: str, difficulty: int) -> np.ndarray:
+def _truth_state(labels: Objects, name: str, difficulty: int, min_height: float) -> np.ndarray:
     height = labels.bbox[:, 3] - labels.bbox[:, 1]
     hard = (
         (labels.occluded > MAX_OCCLUSION[difficulty])
         | (labels.truncated > MAX_TRUNCATION[difficulty])
-        | (height <= MIN_HEIGHT[difficulty])
+        | (height <= min_height)
     )
     state = np.where(labels.type == name, np.where(hard, _IGNORED, _VALID), _OTHER)
     return np.where(labels.type == NEIGHBOUR.get(name, ""), _IGNORED, state)
 
 
-def _detection_state(detections: Objects, name: str, difficulty: int) -> np.ndarray:
+def _detection_state(detections: Objects, name: str, min_height: float) -> np.ndarray:
     # Small detections of every class are ignored, but may still take a truth.
-    small = np.abs(detections.bbox[:, 1] - detections.bbox[:, 3]) < MIN_HEIGHT[difficulty]
+    small = np.abs(detections.bbox[:, 1] - detections.bbox[:, 3]) < min_height
     return np.where(small, _IGNORED, np.where(detections.type == name, _VALID, _OTHER))
 
 
@@ -294,6 +295,7 @@ def evaluate(
     *,
     classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist"),
     min_overlap: Mapping[str, float] = MIN_OVERLAP,
+    min_height: Sequence[float] = MIN_HEIGHT,
 ) -> Evaluation:
     """Precision curves of detections against labels, frame by frame in the same order.
 
@@ -302,19 +304,23 @@ def evaluate(
         detections: the detections of the same frames, with scores.
         classes: classes to evaluate.
         min_overlap: overlap above which (strictly) a detection hits, for each class.
+        min_height: smallest 2D height at each difficulty [pixel]; for images of another size than
+            the benchmark's, multiply by their scale.
 
     Returns:
         `Evaluation`; average precision by `.average_precision(11)` or `(40)`.
 
     Raises:
-        ValueError: not the same number of frames, no frame, a detection without a finite score, or
-            a class without `min_overlap`.
+        ValueError: not the same number of frames, no frame, a detection without a finite score, a
+            class without `min_overlap`, or `min_height` not of three numbers.
     """
     if len(labels) != len(detections) or not labels:
         raise ValueError(
             f"{len(labels)} frames of labels and {len(detections)} of detections, expected the "
             "same number, at least one (a frame without detections is an empty `Objects`)"
         )
+    if len(min_height) != len(DIFFICULTIES) or not min(min_height) >= 0.0:
+        raise ValueError(f"min_height is {tuple(min_height)}, expected three heights >= 0 [pixel]")
     for name in classes:
         if not 0.0 < min_overlap.get(name, -1.0) < 1.0:
             raise ValueError(
@@ -350,8 +356,8 @@ def evaluate(
             for metric, overlap in pairs.overlap.items()
         }
         for d in range(len(DIFFICULTIES)):
-            truth_state = _truth_state(truths, name, d)
-            detection_state = _detection_state(found, name, d)
+            truth_state = _truth_state(truths, name, d, min_height[d])
+            detection_state = _detection_state(found, name, min_height[d])
             n_objects[c, d] = n = int((truth_state == _VALID).sum())
             for m, metric in enumerate(METRICS):
                 if metric == "orientation":

@@ -266,8 +266,25 @@ def test_bad_input_is_named() -> None:
         evaluate(labels, [empty(), select(labels[1], np.array([0]))])
     with pytest.raises(ValueError, match=r"min_overlap\['Tram'\] is None"):
         evaluate(labels, [empty()] * 2, classes=("Tram",))
+    with pytest.raises(ValueError, match=r"min_height is \(40\.0, 25\.0\), expected three"):
+        evaluate(labels, [empty()] * 2, min_height=(40.0, 25.0))
     with pytest.raises(ValueError, match="points=101, expected 11"):
         evaluate(labels, [empty()] * 2).average_precision(101)
+
+
+def test_heights_scale_with_the_image() -> None:
+    labels = make.make_labels(36, 30)
+    detections = make.make_detections(labels, 37)
+
+    def smaller(frames: list[Objects]) -> list[Objects]:
+        return [dataclasses.replace(f, bbox=0.25 * f.bbox) for f in frames]
+
+    whole = evaluate(labels, detections)
+    quarter = evaluate(smaller(labels), smaller(detections), min_height=(10.0, 6.25, 6.25))
+    np.testing.assert_allclose(quarter.precision, whole.precision, atol=1e-12)
+    assert quarter.n_objects.tolist() == whole.n_objects.tolist()
+    lost = evaluate(smaller(labels), smaller(detections))
+    assert (lost.n_objects[0] < whole.n_objects[0]).all()
 
 
 def test_thresholds_follow_recall() -> None:

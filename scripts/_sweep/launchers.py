@@ -166,7 +166,12 @@ def launch_ray(
 
     options: dict[str, Any] = {"address": address}
     if address is None:
-        options = {"num_cpus": max(1, round(workers * cpus)), "include_dashboard": False}
+        # A cluster of this machine alone stays on its loopback: no other address need work.
+        options = {
+            "num_cpus": max(1, round(workers * cpus)),
+            "include_dashboard": False,
+            "_node_ip_address": "127.0.0.1",
+        }
     ray.init(
         log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True, **options
     )

@@ -5,7 +5,7 @@
 Prints the temporary memory of the compiled gradient (2048 samples of 60 parameters, float32) at
 depths 8 and 64, with the reverse rule that recomputes activations and with JAX's own, which stores
 them; and the error of the inverse at trained weights. Expect a ratio of at most 1.1 for ours and
-of about 8 for the other. Writes `results/bench_revnet.json`; 10 s on one core.
+of about 7 for the other. Writes `results/bench_revnet.json`; 10 s on one core.
 """
 
 from __future__ import annotations

@@ -215,8 +215,9 @@ def main(config: Config) -> dict[str, Any]:
         costs = chunk_costs(folder, config.repeats)
         rates = crowd_rates(folder, config.writers, config.repeats)
         times = sweep_times(folder, config.workers, config.steps)
-    # The slowest rate that was seen: more writers than that are not measured.
-    file_s = 1.0 / min(rates.values())
+    # The rate under the largest crowd: a lone writer waits for its own disk and core, not for the
+    # folder, so its rate says nothing about what the folder can take.
+    file_s = 1.0 / rates[str(max(config.writers))]
     simulated = []
     for chunk_s in (1.0, 10.0, 60.0):
         for workers in (1, 10, 100, 300, 1000):
@@ -229,6 +230,7 @@ def main(config: Config) -> dict[str, Any]:
         "chunk": costs,
         "files_per_second_by_writers": rates,
         "sweep_by_workers": times,
+        "load_average": os.getloadavg()[0],
         "file_s": file_s,
         "workers_that_saturate_the_folder": limits,
         "simulated": simulated,
@@ -251,7 +253,7 @@ def run_cli() -> None:
     fields = {f"wall_{k}": v["wall_s"] for k, v in times.items()}
     _run.print_result(
         write_ms=result["chunk"]["16 trials"]["write_ms"],
-        files_per_second=min(result["files_per_second_by_writers"].values()),
+        files_per_second=1.0 / result["file_s"],
         saturate_10s=result["workers_that_saturate_the_folder"]["10 s"],
         **fields,
     )

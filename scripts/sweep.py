@@ -278,6 +278,8 @@ def main(config: Config) -> dict[str, Any]:
     if config.distributed:
         if config.shard or config.workers > 1 or config.launcher != "local":
             raise ValueError("--distributed is one program; leave --shard and --workers out")
+        if config.chunk_size == "auto":
+            raise ValueError("--distributed: processes would measure apart; give --chunk-size N")
         jax.distributed.initialize(config.coordinator, config.processes, config.process)
     if config.shard:
         parse_shard(config.shard)

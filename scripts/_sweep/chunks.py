@@ -167,7 +167,7 @@ def retry_failed(sweep: Sweep) -> int:
         for number in sorted(done_chunks(sweep, budget)):
             path = chunk_path(sweep, number, budget)
             if (load_chunk(path, ())["status"] == FAILED).any():
-                path.unlink()
+                path.unlink(missing_ok=True)
                 count += 1
     return count
 

@@ -196,8 +196,8 @@ def done_chunks(sweep: Sweep, budget: int | None = None) -> set[int]:
     folder = _chunk_folder(sweep, budget)
     if not folder.is_dir():
         return set()
-    names = os.listdir(folder)
-    return {int(name[:6]) for name in names if name.endswith(".npz") and name[:6].isdigit()}
+    names = (name.removesuffix(".npz") for name in os.listdir(folder) if name.endswith(".npz"))
+    return {int(name) for name in names if name.isdigit()}
 
 
 def save_chunk(

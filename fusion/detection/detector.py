@@ -1,0 +1,157 @@
+"""AVOD and AVOD-ARGate: the networks between the two views and the scores of anchors and boxes.
+
+The sensors are in the order (camera, lidar) everywhere. `Detector` is what is used after training;
+`AuxiliaryHeads` and the lattice of the targets are there in training only.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from fusion.detection.crop import crop_and_resize
+from fusion.detection.heads import MapGate, RpnHead, SecondHead
+from fusion.detection.initialize import draw_weights
+from fusion.detection.settings import DetectorConfig
+from fusion.detection.views import FeaturePyramid
+from fusion.targets import init_targets
+
+__all__ = [
+    "AuxiliaryHeads",
+    "Detector",
+    "Encoded",
+    "count_main_parameters",
+    "crop_views",
+    "fuse",
+    "init_detector",
+]
+
+SENSORS = ("camera", "lidar")
+# Output layers start small: even class scores, boxes at their anchors. The gate's starts at zero,
+# so that training starts from equal weights, as AVOD fuses.
+_OUTPUTS = {"objectness": 0.01, "offsets": 0.01, "classes": 0.01, "angle": 0.01, "fusion": 0.0}
+
+
+class Encoded(NamedTuple):
+    """Of a batch of frames: feature maps and one-channel maps of (camera, lidar), fusion weights.
+
+    Attributes:
+        features: two arrays `[b, h, w, f]`.
+        maps: two arrays `[b, h, w, 1]`.
+        weights: `[b, 2]`, sum to one.
+    """
+
+    features: tuple[Array, Array]
+    maps: tuple[Array, Array]
+    weights: Array
+
+
+class Detector(nn.Module):
+    """The main network; use its methods through `apply(..., method=...)`."""
+
+    config: DetectorConfig
+
+    def setup(self) -> None:
+        """Both views, the gate of `avod_argate`, both stages' heads."""
+        c = self.config
+        self.views = [
+            FeaturePyramid(c.widths, c.layers, c.norm, name=f"{sensor}_view") for sensor in SENSORS
+        ]
+        self.reduce = [nn.Conv(1, (1, 1), name=f"{sensor}_map") for sensor in SENSORS]
+        if c.model == "avod_argate":
+            self.gate = MapGate(c.gate_width, c.normalizer)
+        self.rpn = RpnHead(c.rpn_width, c.dropout)
+        self.second = SecondHead(c.fc_widths, c.dropout)
+
+    def encode(
+        self, image: Float[Array, "b h w 3"], bev: Float[Array, "b r c s"], train: bool
+    ) -> Encoded:
+        """Maps of both views and the fusion weights (0.5 each without a gate)."""
+        camera = self.views[0](image, train)
+        lidar = self.views[1](bev, train)
+        maps = (nn.relu(self.reduce[0](camera)), nn.relu(self.reduce[1](lidar)))
+        if self.config.model == "avod_argate":
+            weights = self.gate(maps)
+        else:
+            weights = jnp.full((image.shape[0], 2), 0.5)
+        return Encoded((camera, lidar), maps, weights)
+
+    def first_stage(self, crops: Array, train: bool) -> tuple[Array, Array]:
+        """`RpnHead` on fused crops of the one-channel maps."""
+        return self.rpn(crops, train)
+
+    def second_stage(self, crops: Array, train: bool) -> tuple[Array, Array, Array]:
+        """`SecondHead` on fused crops of the feature maps."""
+        return self.second(crops, train)
+
+    def __call__(self, image: Array, bev: Array) -> Encoded:
+        """Touch every parameter once (for `init`)."""
+        c = self.config
+        encoded = self.encode(image, bev, False)
+        self.rpn(jnp.zeros((1, c.rpn_crop, c.rpn_crop, 1)), False)
+        self.second(jnp.zeros((1, c.second_crop, c.second_crop, c.widths[0])), False)
+        return encoded
+
+
+class AuxiliaryHeads(nn.Module):
+    """One first-stage head per view, on that view's crops alone (training only)."""
+
+    config: DetectorConfig
+
+    @nn.compact
+    def __call__(self, crops: tuple[Array, Array], train: bool) -> list[tuple[Array, Array]]:
+        """Scores and offsets of each view."""
+        c = self.config
+        return [
+            RpnHead(c.rpn_width, c.dropout, name=sensor)(x, train)
+            for sensor, x in zip(SENSORS, crops, strict=True)
+        ]
+
+
+def crop_views(
+    maps: tuple[Array, Array], boxes: tuple[Array, Array], size: int
+) -> tuple[Array, Array]:
+    """Crops `[b, n, size, size, c]` of both views' maps at their boxes `[b, n, 4]`."""
+    crop = jax.vmap(lambda m, b: crop_and_resize(m, b, (size, size)))
+    return crop(maps[0], boxes[0]), crop(maps[1], boxes[1])
+
+
+def fuse(crops: tuple[Array, Array], scale: Float[Array, "b 2"]) -> Array:
+    r"""Mean of the scaled crops, :math:`\frac{1}{2} \sum_k s_k x_k`.
+
+    The scale is 2 w, so that equal weights are AVOD's mean; times the path drop's factor in
+    training.
+    """
+    factor = 0.5 * scale[:, :, None, None, None, None]
+    return factor[:, 0] * crops[0] + factor[:, 1] * crops[1]
+
+
+def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
+    """Fresh parameters `{"main", "auxiliary", "targets"}` and the statistics of batch norm.
+
+    `avod` has `main` alone; the statistics are empty with group norm.
+    """
+    main_key, aux_key, target_key = jax.random.split(key, 3)
+
+    def shape(*sides: int) -> jax.ShapeDtypeStruct:
+        return jax.ShapeDtypeStruct((1, *sides), jnp.float32)
+
+    image, bev = shape(*config.image_size, 3), shape(*config.bev.shape, config.bev.n_slices + 1)
+    variables = draw_weights(main_key, Detector(config), image, bev, scales=_OUTPUTS)
+    params: dict[str, Any] = {"main": variables["params"]}
+    if config.model == "avod_argate":
+        crop = shape(config.rpn_crop, config.rpn_crop, 1)
+        heads = draw_weights(aux_key, AuxiliaryHeads(config), (crop, crop), False, scales=_OUTPUTS)
+        params["auxiliary"] = heads["params"]
+        params["targets"] = init_targets(target_key, config.targets, 2)
+    return params, variables.get("batch_stats", {})
+
+
+def count_main_parameters(config: DetectorConfig) -> int:
+    """Parameters that inference uses, without making them."""
+    shapes = jax.eval_shape(lambda: init_detector(jax.random.key(0), config)[0]["main"])
+    return sum(leaf.size for leaf in jax.tree.leaves(shapes))

@@ -1,0 +1,92 @@
+"""What reads the feature maps: the first stage's head, the gate, the second stage's head."""
+
+from __future__ import annotations
+
+import flax.linen as nn
+import jax.numpy as jnp
+from jaxtyping import Array, Float
+
+from fusion.gating import Normalizer, normalize
+
+__all__ = ["MapGate", "RpnHead", "SecondHead"]
+
+
+class RpnHead(nn.Module):
+    """Two towers over fused crops: is there an object, and where is it from the anchor.
+
+    A 3x3 convolution over a 3x3 crop without padding has one output, so the tower's convolutions
+    are dense layers.
+
+    Source: Ku et al. (2018), section III-C.
+    """
+
+    width: int
+    dropout: float
+
+    @nn.compact
+    def __call__(
+        self, crops: Float[Array, "*b s s c"], train: bool
+    ) -> tuple[Float[Array, "*b 2"], Float[Array, "*b 6"]]:
+        """Scores of background and object, and six offsets, of each crop."""
+        flat = crops.reshape(*crops.shape[:-3], -1)
+        outputs = []
+        for name, n in (("objectness", 2), ("offsets", 6)):
+            x = flat
+            for i in range(2):
+                x = nn.relu(nn.Dense(self.width, name=f"{name}{i}")(x))
+                x = nn.Dropout(self.dropout, deterministic=not train)(x)
+            outputs.append(nn.Dense(n, name=name)(x))
+        return outputs[0], outputs[1]
+
+
+class MapGate(nn.Module):
+    r"""Fusion weights of a frame from the one-channel map of each view.
+
+    .. math:: w = N\Big(W_o \, \mathrm{relu}\big(\textstyle\sum_k W_k p_k + b_k\big) + b_o\Big)
+
+    :math:`p_k` are the mean and the maximum over the map of view k after two strided convolutions,
+    :math:`N` the normalizer. `init_detector` starts the last layer at zero, that is from equal
+    weights, as AVOD fuses.
+
+    Source: M. S. Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
+    """
+
+    width: int
+    normalizer: Normalizer
+
+    @nn.compact
+    def __call__(self, maps: tuple[Array, ...]) -> Float[Array, "b k"]:
+        """Weights of the views for every frame."""
+        hidden = jnp.zeros((maps[0].shape[0], self.width))
+        for k, x in enumerate(maps):
+            for i, features in enumerate((8, 16)):
+                conv = nn.Conv(features, (5, 5), strides=(4, 4), name=f"view{k}_conv{i}")
+                x = nn.relu(conv(x))
+            pooled = jnp.concatenate([x.mean(axis=(1, 2)), x.max(axis=(1, 2))], axis=-1)
+            hidden = hidden + nn.Dense(self.width, name=f"view{k}")(pooled)
+        last = nn.Dense(len(maps), name="fusion")
+        return normalize(last(nn.relu(hidden)), self.normalizer)
+
+
+class SecondHead(nn.Module):
+    """Class, box and heading of each proposal from its fused crop.
+
+    Source: Ku et al. (2018), section III-D.
+    """
+
+    widths: tuple[int, ...]
+    dropout: float
+    n_classes: int = 2
+
+    @nn.compact
+    def __call__(
+        self, crops: Float[Array, "*b s s c"], train: bool
+    ) -> tuple[Float[Array, "*b n"], Float[Array, "*b 10"], Float[Array, "*b 2"]]:
+        """Class scores (background first), ten corner offsets [m], and the angle vector."""
+        x = crops.reshape(*crops.shape[:-3], -1)
+        for i, width in enumerate(self.widths):
+            x = nn.relu(nn.Dense(width, name=f"fc{i}")(x))
+            x = nn.Dropout(self.dropout, deterministic=not train)(x)
+        scores = nn.Dense(self.n_classes, name="classes")(x)
+        offsets = nn.Dense(10, name="offsets")(x)
+        return scores, offsets, nn.Dense(2, name="angle")(x)

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from failure import gp
-from failure.optimize import Domain, bfgs, project, sample
+from failure.optimize import Domain, bfgs, polish, project, sample
 
 __all__ = [
     "ACQUISITIONS",
@@ -205,6 +205,8 @@ def propose(
     domain: Domain,
     best: Float[Array, ""],
     raw: Float[Array, "r d"],
+    *,
+    newton_steps: int = 0,
 ) -> tuple[Float[Array, "q d"], Float[Array, " q"]]:
     """Maximise the acquisition by multi-start ascent; one program, every start a lane.
 
@@ -215,6 +217,8 @@ def propose(
         domain: where to look.
         best: best (standardised) output so far.
         raw: candidate starts, from :func:`raw_points`.
+        newton_steps: Newton steps that finish the three best ascents of each maximum. A search
+            does without: the last tenth of a percent of the improvement does not move its points.
 
     Returns:
         ``(points [q, d], acquisition values [q])``.
@@ -256,6 +260,15 @@ def propose(
     points = points.reshape(config.batch_size, config.n_restarts, -1)
     values = values.reshape(config.batch_size, config.n_restarts)
     values = jnp.where(jnp.isfinite(values), values, -jnp.inf)
+    if newton_steps > 0:
+
+        def finish(start: Array, weight: Array) -> tuple[Array, Array]:
+            x, end = polish(lambda x: -value(x[None], weight)[0], start, domain, steps=newton_steps)
+            return x, -end
+
+        _, best_lanes = jax.lax.top_k(values, min(3, config.n_restarts))
+        points = jnp.take_along_axis(points, best_lanes[:, :, None], axis=1)
+        points, values = jax.vmap(jax.vmap(finish, (0, None)))(points, weights)
     winner = jnp.argmax(values, 1)
     rows = jnp.arange(config.batch_size)
     return points[rows, winner], values[rows, winner]

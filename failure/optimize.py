@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-__all__ = ["BFGSResult", "Domain", "ball", "bfgs", "box", "project", "sample"]
+__all__ = ["BFGSResult", "Domain", "ball", "bfgs", "box", "polish", "project", "sample"]
 
 
 class Domain(NamedTuple):
@@ -223,3 +223,46 @@ def bfgs(
 
     end = jax.lax.while_loop(going, turn, state)
     return BFGSResult(end.x, end.value, end.grad, end.h, end.n_evals, end.converged, end.aux)
+
+
+def polish(
+    value: Callable[[Array], Array], x0: Float[Array, " d"], domain: Domain, *, steps: int
+) -> tuple[Float[Array, " d"], Float[Array, ""]]:
+    r"""Finish a descent by Newton steps on the coordinates that no bound holds.
+
+    .. math:: p = -|H_{FF}|^{-1} g_F, \qquad x \leftarrow P(x + t p)
+
+    with :math:`F` the coordinates that are not pressed against a bound and :math:`|H|` the Hessian
+    with the absolute values of its eigenvalues; :math:`t` is the best of eight lengths, none
+    included, so the value never rises. Meant for the last digits: a Hessian costs d gradients.
+
+    Args:
+        value: what is minimised, twice differentiable.
+        x0: start, inside the domain.
+        domain: the feasible set; on a sphere the projection replaces the constraint.
+        steps: Newton steps.
+
+    Returns:
+        ``(x, value)``.
+
+    Source: Bertsekas (1982), two-metric projection; Nocedal and Wright (2006), Section 3.4.
+    """
+    lengths = jnp.asarray([1.0, 2.0, 0.5, 0.25, 0.1, 0.03, 0.01, 0.0], x0.dtype)
+
+    def step(x: Array, _: None) -> tuple[Array, None]:
+        grad, hessian = jax.grad(value)(x), jax.hessian(value)(x)
+        blocked = ((x <= domain.lower) & (grad > 0)) | ((x >= domain.upper) & (grad < 0))
+        free = (~blocked).astype(x.dtype)
+        inner = hessian * (free[:, None] * free[None, :]) + jnp.diag(1.0 - free)
+        inner = jnp.where(jnp.isfinite(inner), inner, jnp.zeros_like(inner))
+        bend, axes = jnp.linalg.eigh(inner)
+        bend = jnp.maximum(jnp.abs(bend), 1e-8 * jnp.max(jnp.abs(bend)) + 1e-30)
+        move = -free * (axes @ ((axes.T @ (free * grad)) / bend))
+        trials = jax.vmap(project, (None, 0))(domain, x[None] + lengths[:, None] * move[None])
+        values = jax.vmap(value)(trials)
+        # Length zero is x itself, which a projection may move by a rounding error.
+        trials = trials.at[-1].set(x)
+        return trials[jnp.argmin(jnp.where(jnp.isfinite(values), values, jnp.inf))], None
+
+    x, _ = jax.lax.scan(step, x0, None, length=steps)
+    return x, value(x)

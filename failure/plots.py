@@ -10,7 +10,7 @@ from matplotlib.figure import Figure
 
 from failure.bayesopt import best_so_far
 
-__all__ = ["plot_activity", "plot_trend"]
+__all__ = ["plot_activity", "plot_shares", "plot_trend"]
 
 
 def plot_trend(
@@ -74,5 +74,24 @@ def plot_activity(
     axes.set_yticks(range(len(quantities)), quantities, fontsize=7)
     axes.set_title(title, fontsize=9)
     figure.colorbar(image, ax=axes)
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=150)
+
+
+def plot_shares(path: Path, shares: Mapping[str, float], *, title: str) -> None:
+    """Bars of one share per transistor, and what each would have if all were alike.
+
+    Args:
+        path: file to write.
+        shares: transistor -> share, in the order of the bars.
+        title: of the picture.
+    """
+    figure = Figure(figsize=(0.32 * len(shares) + 1.6, 3.0), layout="constrained")
+    axes = figure.add_subplot()
+    axes.bar(list(shares), list(shares.values()))
+    axes.axhline(1.0 / len(shares), color="black", linestyle="--", linewidth=1.0)
+    axes.tick_params(axis="x", rotation=90, labelsize=7)
+    axes.set_ylabel("mean fusion weight")
+    axes.set_title(title, fontsize=9)
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=150)

@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from failure.optimize import ball, bfgs, box, sample
+from failure.optimize import ball, bfgs, box, polish, sample
 
 
 @pytest.fixture(autouse=True)
@@ -92,3 +92,17 @@ def test_uniform_points_of_a_ball_have_the_known_mean_radius():
     assert radius.max() <= 2.0 + 1e-12
     # E|x| = r d / (d + 1)
     assert abs(radius.mean() - 2.0 * 5 / 6) < 0.02
+
+
+def test_polish_reaches_the_constrained_minimum_to_the_last_digit():
+    """A bent, badly scaled function whose minimum in the first coordinate is cut off by a bound."""
+
+    def value(x):
+        return 50.0 * (x[1] - x[0] ** 2) ** 2 + (1.0 - x[0]) ** 2 + 0.1 * (x[2] - 2.0) ** 4
+
+    with jax.enable_x64(True):
+        domain = box(jnp.full(3, -1.5), jnp.asarray([0.5, 1.5, 1.5]))
+        start = jnp.asarray([0.1, 0.3, 0.0])
+        x, end = jax.jit(lambda x: polish(value, x, domain, steps=12))(start)
+    np.testing.assert_allclose(x, [0.5, 0.25, 1.5], atol=1e-9)
+    assert float(end) <= float(value(start))

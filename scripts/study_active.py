@@ -7,7 +7,7 @@ searches below `--runs` (made by `study_failures.py`), or on fresh uniform sampl
 how many features hold half and nine tenths of the fusion weight, the transistors behind them (by
 the Jacobian of the inverse network), and the source's check: a small network on the active features
 alone against one on all of them, on samples that neither has seen. Writes
-`results/study_active.json` and one bar chart per specification to `--out`. About 1 CPU-minute per specification.
+`results/study_active.json` and one bar chart per specification to `--out`. About 1 CPU-minute each.
 """
 
 from __future__ import annotations

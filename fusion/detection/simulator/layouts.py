@@ -119,36 +119,41 @@ def read_layouts(folder: str | Path) -> list[Layout]:
 def keep_apart(layout: Layout) -> Layout:
     """Without the things whose footprints run into one that comes earlier."""
     boxes = layout.footprints()
+    shared = rotated_intersection(boxes[:, None], boxes[None]) > 0.0
     kept: list[int] = []
     for i in range(len(layout)):
-        shared = rotated_intersection(boxes[i], boxes[kept]) if kept else np.zeros(0)
-        if not (shared > 0.0).any():
+        if not shared[i, kept].any():
             kept.append(i)
     return _take(layout, np.array(kept, np.int64))
+
+
+def _thing(
+    rng: np.random.Generator, names: tuple[str, ...]
+) -> tuple[str, np.ndarray, np.ndarray, float]:
+    """Class, size, place and heading of one thing of the fitted model."""
+    shares = np.array([_SIZES[name][2] for name in names])
+    name = str(rng.choice(names, p=shares / shares.sum()))
+    mean, sd, _ = _SIZES[name]
+    size = np.asarray(mean) + np.asarray(sd) * np.clip(rng.normal(size=3), -2.5, 2.5)
+    lane = _LANES[rng.choice(len(_LANES), p=[lane[2] for lane in _LANES])]
+    z = rng.gamma(2.95, 9.5)
+    x = rng.normal(lane[0], lane[1])
+    away = rng.uniform() < lane[3]
+    yaw = (-0.5 if away else 0.5) * np.pi + rng.normal(0.0, 0.06)
+    if rng.uniform() < 0.25 or name in _OTHERS:
+        yaw = rng.uniform(-np.pi, np.pi)
+    return name, size, np.array([x, z]), yaw
 
 
 def generated_layout(rng: np.random.Generator) -> Layout:
     """A street drawn from the fitted model; nothing in it overlaps."""
     rows: list[tuple[str, np.ndarray, np.ndarray, float]] = []
-    # Negative binomial with mean m and variance v: p = m / v, n = m p / (1 - p).
-    counts = (
-        1 + rng.negative_binomial(2.3, 0.40),
-        rng.negative_binomial(0.22, 0.21),
-    )
-    for names, count in zip((_VEHICLES, _OTHERS), counts, strict=True):
-        shares = np.array([_SIZES[name][2] for name in names])
-        for _ in range(count):
-            name = str(rng.choice(names, p=shares / shares.sum()))
-            mean, sd, _ = _SIZES[name]
-            size = np.asarray(mean) + np.asarray(sd) * np.clip(rng.normal(size=3), -2.5, 2.5)
-            lane = _LANES[rng.choice(len(_LANES), p=[lane[2] for lane in _LANES])]
-            z = 2.5 + rng.gamma(2.95, 9.5)
-            x = rng.normal(lane[0], lane[1])
-            away = rng.uniform() < lane[3]
-            yaw = (-0.5 if away else 0.5) * np.pi + rng.normal(0.0, 0.06)
-            if rng.uniform() < 0.25 or name in _OTHERS:
-                yaw = rng.uniform(-np.pi, np.pi)
-            rows.append((name, size, np.array([x, z]), yaw))
+    # Negative binomial with mean m and variance v: p = m / v, n = m p / (1 - p). Some 12 % are
+    # left out below as they would overlap, so more are asked for.
+    while not rows:
+        counts = (rng.negative_binomial(2.3, 0.31), rng.negative_binomial(0.22, 0.21))
+        for names, count in zip((_VEHICLES, _OTHERS), counts, strict=True):
+            rows += [_thing(rng, names) for _ in range(count)]
     names_, sizes, places, yaws = zip(*rows, strict=True)
     layout = Layout(
         np.array(names_, "<U14"), np.array(sizes), np.array(places), np.array(yaws),

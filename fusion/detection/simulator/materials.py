@@ -123,16 +123,18 @@ def surfaces(
     )
     colour = put(colour, of("building") & pane & (hits.face >= 2), GLASS)
 
-    # A body in the colour of the road, glass and wheels included.
-    blend = 0.95 * jnp.asarray(scene.low_contrast)[slot][:, None]
+    # A body in the colour of the road, glass and wheels included, and lit like the road.
+    hidden = jnp.where(hits.body >= 0, jnp.asarray(scene.low_contrast)[slot], 0.0)
+    blend = 0.95 * hidden[:, None]
     colour = (1.0 - blend) * colour + blend * scene.ground_paint[None, 0]
+    normal = (1.0 - blend) * hits.normal + blend * scene.plane[None, :3]
     reflectivity = jnp.asarray(scene.reflectivity)[slot]
 
     ground_colour, ground_reflectivity = _ground(scene, point)
     on_ground, sky = hits.body == GROUND, hits.body == SKY
     colour = jnp.where(on_ground[:, None], ground_colour, colour)
     reflectivity = jnp.where(on_ground, ground_reflectivity, reflectivity)
-    toward_sun = jnp.maximum(hits.normal @ scene.sun, 0.0)
+    toward_sun = jnp.maximum(normal @ scene.sun, 0.0)
     shade = scene.light[0] + (1.0 - scene.light[0]) * toward_sun
     unit = directions / jnp.linalg.norm(directions, axis=1, keepdims=True)
     haze = jnp.clip(1.0 + 2.0 * unit[:, 1], 0.0, 1.0)[:, None]  # paler towards the horizon

@@ -24,7 +24,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Key, PRNGKeyArray
 
 from fusion.detection.calibration import Calibration, camera_to_lidar, lidar_to_camera
 from fusion.detection.hdl64 import AZIMUTH_STEP, ELEVATIONS, RANGE_NOISE
@@ -81,6 +81,7 @@ class SensorConfig:
 
 
 SIZES = {
+    "tiny": SensorConfig(width=192, height=58, azimuth_steps=4),
     "small": SensorConfig(width=320, height=96, rays_per_side=2, azimuth_steps=3),
     "paper": SensorConfig(),
 }
@@ -224,7 +225,7 @@ def _lidar(scene: Scene, beams: Rays, key: PRNGKeyArray, config: SensorConfig) -
 def render(
     scenes: Scene,
     beams: Rays,
-    keys: PRNGKeyArray,
+    keys: Key[Array, "f"],
     config: SensorConfig,
     *,
     batch_size: int | None = None,

@@ -17,7 +17,7 @@ from jaxsnn import network
 from jaxsnn.architecture import NetworkConfig, NetworkParams, check_network
 from jaxsnn.encoding import group_rates, poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
-from jaxsnn.rewards import motor_rewards, terminal_reward
+from jaxsnn.rewards import motor_rewards, tempered, terminal_reward
 from jaxsnn.window import STDPKernel
 from jaxsnn.world import Outcome, Reading
 
@@ -55,10 +55,10 @@ class SNNParams(NamedTuple):
 
 
 class SNNMemory(NamedTuple):
-    """Eligibility of the last held window and the reward for what was seen."""
+    """Eligibility of the last held window and what was seen."""
 
     eligibility: Eligibility | None
-    reward: Float[Array, "2"]
+    reading: Reading
 
 
 def snn_params(config: NetworkConfig, params: NetworkParams) -> SNNParams:
@@ -105,6 +105,13 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
     n_windows = config.control_steps // config.hold_steps
     table = config.rates
 
+    def earned(constants: NetworkParams, reading: Reading, held: Eligibility) -> Array:
+        turn = steering_angle(constants, held.output_count / held.duration)
+        reward = motor_rewards(
+            constants.reward, reading.sonar, reading.distance, reading.angle, turn
+        )
+        return tempered(constants.reward, reward, turn)
+
     def init(key: Key[Array, ""], params: SNNParams) -> NetworkState:
         return network.init(key, config, params.network)
 
@@ -119,7 +126,6 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         constants = params.network
         by_group = group_rates(table, reading.sonar, reading.distance, reading.angle)
         rates = jnp.repeat(by_group, config.group_exc + config.group_inh)
-        reward = motor_rewards(constants.reward, reading.sonar, reading.distance, reading.angle)
         state = network.settle(constants, state, fresh)
 
         def draw(index: Array | int) -> Array:
@@ -148,8 +154,9 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
                 state, held, spikes = run(state, index, held_keep)
                 if plastic:
                     weights = network.reinforce(
-                        config, constants, state.weights, held, reward, going
-                    )
+                        config, constants, state.weights, held,
+                        earned(constants, reading, held), going,
+                    )  # fmt: skip
                     state = state._replace(weights=weights)
                 return (state, total + count(spikes)), None
 
@@ -158,7 +165,7 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         state, held, spikes = run(state, n_windows - 1, keep)
         firing = (total + count(spikes)) / (config.control_steps * config.dt)
         steering = steering_angle(constants, firing[:2])
-        return state, steering, SNNMemory(held, reward), firing
+        return state, steering, SNNMemory(held, reading), firing
 
     def learn(
         params: SNNParams,
@@ -171,11 +178,10 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         if not plastic or memory.eligibility is None:
             return state
         constants = params.network
-        reward = memory.reward
+        seen = memory.reading
         if config.reward_timing == "after" and next_reading is not None:
-            reward = motor_rewards(
-                constants.reward, next_reading.sonar, next_reading.distance, next_reading.angle
-            )
+            seen = next_reading
+        reward = earned(constants, seen, memory.eligibility)
         end = terminal_reward(constants.reward, outcome.collided, outcome.arrived)
         reward = jnp.where(outcome.collided | outcome.arrived, end, reward)
         going = active.astype(jnp.float32)

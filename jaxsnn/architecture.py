@@ -142,7 +142,12 @@ class NetworkParams(NamedTuple):
         homeostasis: rate of synaptic scaling [1/s]; 0 is the source. While a neuron fires above
             its target rate, its excitatory inputs shrink and its inhibitory ones grow, and the
             other way round below it. Without it, what has grown fires more and grows faster.
+        homeostasis_output: rate of the scaling of the second layer relative to `homeostasis`. It is
+            what keeps one motor from winning for good.
         rate_hidden, rate_output: target rates of the scaling [Hz].
+        centring: share of a presynaptic neuron's mean firing that is taken off before the trace is
+            formed; 0 is the source, 1 makes the trace a covariance (see `baseline`).
+        tau_usual: time constant of that mean [s].
     """
 
     hidden: LIFParams = LIFParams()
@@ -159,6 +164,9 @@ class NetworkParams(NamedTuple):
     gain_output: float | Array = 1.0
     steering_gain: float | Array = 1.0
     homeostasis: float | Array = 0.0
+    homeostasis_output: float | Array = 1.0
+    centring: float | Array = 0.0
+    tau_usual: float | Array = 20.0
     rate_hidden: float | Array = 25.0
     rate_output: float | Array = 60.0
 
@@ -197,10 +205,19 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
     check_lif(params.output, dt=config.dt)
     check_stdp(params.stdp, dt=config.dt)
     check_rewards(params.reward)
+    require_positive("tau_usual", params.tau_usual, "give it in seconds")
     positive = ("w_max", "w_max_low", "gain_input", "gain_output", "rate_hidden", "rate_output")
     for name in positive:
         require_positive(name, getattr(params, name), "give it in mV (rates: Hz)")
-    for name in ("gamma", "gamma_output", "w_min", "init_low", "homeostasis"):
+    for name in (
+        "gamma",
+        "gamma_output",
+        "w_min",
+        "init_low",
+        "homeostasis",
+        "homeostasis_output",
+        "centring",
+    ):
         require_positive(name, getattr(params, name), "give a number >= 0", zero=True)
     require_finite("steering_gain", params.steering_gain, "give degrees per Hz")
 

@@ -25,6 +25,7 @@ from jaxsnn.architecture import (
     neuron_signs,
     weight_bounds,
 )
+from jaxsnn.baseline import Baseline, baseline_init, baseline_update
 from jaxsnn.neurons import LIFParams, LIFState, lif_init, lif_step
 from jaxsnn.plasticity import STDPState, apply_reward, check_bounds, stdp_init, stdp_step
 from jaxsnn.rewards import synapse_signs
@@ -50,13 +51,18 @@ __all__ = [
 
 
 class NetworkState(NamedTuple):
-    """Weights, membranes of both layers, traces and eligibility of both sets of synapses."""
+    """Weights, membranes of both layers, traces and eligibility of both sets of synapses.
+
+    The baselines are what input and hidden neurons usually fire; see `baseline`.
+    """
 
     weights: Weights
     hidden: LIFState
     output: LIFState
     stdp_hidden: STDPState
     stdp_output: STDPState
+    usual_input: Baseline
+    usual_hidden: Baseline
 
 
 class Eligibility(NamedTuple):
@@ -124,6 +130,28 @@ def init(
         stdp_output=jax.tree.map(
             lambda x: jnp.broadcast_to(x, (2, *x.shape)), stdp_init(config.n_half, 1)
         ),
+        usual_input=baseline_init(config.n_in),
+        usual_hidden=baseline_init(config.n_hidden),
+    )
+
+
+def _centred(params: NetworkParams, state: NetworkState, pre: Array, hidden: Array) -> tuple:
+    """Spikes `[..., n]` of both presynaptic sides, less what these neurons usually fire."""
+
+    def less(spikes: Array, usual: Baseline) -> Array:
+        return spikes - jnp.broadcast_to(params.centring * usual.mean, spikes.shape)
+
+    return less(pre, state.usual_input), less(hidden, state.usual_hidden)
+
+
+def _used_to(
+    params: NetworkParams, state: NetworkState, pre: Array, hidden: Array, duration: float
+) -> tuple[Baseline, Baseline]:
+    """Both baselines after `duration` with these mean spikes per step."""
+    tau = params.tau_usual
+    return (
+        baseline_update(state.usual_input, pre, tau=tau, duration=duration),
+        baseline_update(state.usual_hidden, hidden, tau=tau, duration=duration),
     )
 
 
@@ -185,10 +213,12 @@ def step(
     hidden, output, spikes = _fire(
         config, params, state, jump, _signed_output(config, params, weights)
     )
-    stdp_hidden = stdp_step(params.stdp, state.stdp_hidden, pre, spikes.hidden, dt=config.dt)
+    first, second = _centred(params, state, pre, spikes.hidden)
+    stdp_hidden = stdp_step(params.stdp, state.stdp_hidden, first, spikes.hidden, dt=config.dt)
     stdp_output = jax.vmap(lambda s, x, y: stdp_step(params.stdp, s, x, y, dt=config.dt))(
-        state.stdp_output, spikes.hidden.reshape(2, -1), spikes.output[:, None]
+        state.stdp_output, second.reshape(2, -1), spikes.output[:, None]
     )
+    usual = _used_to(params, state, pre, spikes.hidden, config.dt)
     held = Eligibility(
         hidden=stdp_hidden.z * config.dt,
         output=stdp_output.z[..., 0] * config.dt,
@@ -197,7 +227,7 @@ def step(
         duration=config.dt,
     )
     weights = reinforce(config, params, weights, held, reward)
-    return NetworkState(weights, hidden, output, stdp_hidden, stdp_output), spikes
+    return NetworkState(weights, hidden, output, stdp_hidden, stdp_output, *usual), spikes
 
 
 def _signed_output(config: NetworkConfig, params: NetworkParams, weights: Weights) -> Array:
@@ -251,18 +281,26 @@ def window(
         all spikes.
     """
     state, spikes = fire(config, params, state, pre)
-    halves = spikes.hidden.reshape(-1, 2, config.n_half)
-    stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, pre, spikes.hidden, keep)
+    seen, active = _centred(params, state, pre, spikes.hidden)
+    stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, seen, spikes.hidden, keep)
     stdp_output, second = jax.vmap(stdp_window, in_axes=(None, 0, 1, 1, None))(
-        stdp, state.stdp_output, halves, spikes.output[:, :, None], keep
+        stdp,
+        state.stdp_output,
+        active.reshape(-1, 2, config.n_half),
+        spikes.output[:, :, None],
+        keep,
     )
-    state = state._replace(stdp_hidden=stdp_hidden, stdp_output=stdp_output)
+    duration = pre.shape[0] * config.dt
+    usual = _used_to(params, state, pre.mean(axis=0), spikes.hidden.mean(axis=0), duration)
+    state = NetworkState(
+        state.weights, state.hidden, state.output, stdp_hidden, stdp_output, *usual
+    )
     held = Eligibility(
         hidden=first,
         output=second[..., 0],
         hidden_count=jnp.sum(spikes.hidden, axis=0),
         output_count=jnp.sum(spikes.output, axis=0),
-        duration=pre.shape[0] * config.dt,
+        duration=duration,
     )
     return state, held, spikes
 
@@ -306,7 +344,9 @@ def reinforce(
         output=(params.gamma_output * to_second * by_neuron).reshape(2, -1) * eligibility.output,
     )
     short_hidden = eta * (eligibility.duration - eligibility.hidden_count / params.rate_hidden)
-    short_output = eta * (eligibility.duration - eligibility.output_count / params.rate_output)
+    short_output = (eta * params.homeostasis_output) * (
+        eligibility.duration - eligibility.output_count / params.rate_output
+    )
     scaled = Weights(
         hidden=weights.hidden
         * jnp.where(

@@ -5,12 +5,13 @@ Index 0 is the left motor, 1 the right one. The left motor turns the robot to th
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsnn._checks import require, require_finite, require_positive
+from jaxsnn._checks import concrete, require, require_finite, require_positive
 from jaxsnn.encoding import angle_region
 
 __all__ = [
@@ -21,6 +22,7 @@ __all__ = [
     "reward_params",
     "synapse_signs",
     "target_reward",
+    "tempered",
     "terminal_reward",
 ]
 
@@ -36,6 +38,15 @@ class RewardParams(NamedTuple):
         r3_base: what Eq. 2.10 adds at the rim of the vicinity.
         opponent: what the motor that `r3` is not for gets, as a multiple of `-r3`; 0 is the source.
             (`r1` and `r2` are opposite by Eq. 2.9; with 1, so is the reward for the target.)
+        target_near_obstacle: factor on `r3` while an obstacle is within `d_safe`; 1 is the source.
+            With 0, avoidance goes first; a wide vicinity of the target needs that, or the target
+            pulls the robot through what is in between.
+        goal_angle: turn [deg] at which nothing is left to learn, see `tempered`; infinite in the
+            source.
+        commit: with 1, an obstacle that is nearest straight ahead rewards the turn that the robot
+            makes anyway, whichever it is. The source names only obstacles on the right and on the
+            left; before a wall the nearer side is a matter of chance, and what one step teaches the
+            next one takes back.
     """
 
     collision: float | Array = -2.0
@@ -45,6 +56,9 @@ class RewardParams(NamedTuple):
     d_target: float | Array = 200.0
     r3_base: float | Array = 1.0
     opponent: float | Array = 0.0
+    target_near_obstacle: float | Array = 1.0
+    goal_angle: float | Array = math.inf
+    commit: float | Array = 0.0
 
 
 def reward_params(rule: str, **changes: float) -> RewardParams:
@@ -67,7 +81,12 @@ def check_rewards(params: RewardParams) -> None:
     """
     for name in ("d_safe", "d_target"):
         require_positive(name, getattr(params, name), "give it in pixels")
-    for name in ("collision", "arrival", "k", "r3_base", "opponent"):
+    goal = concrete(params.goal_angle)
+    require(
+        goal is None or bool((goal > 0).all()),
+        f"goal_angle = {goal}: expected degrees > 0, or infinity for a reward without an end",
+    )
+    for name in ("collision", "arrival", "k", "r3_base", "opponent", "target_near_obstacle"):
         require_finite(name, getattr(params, name), "give a number")
 
 
@@ -109,6 +128,7 @@ def motor_rewards(
     sonar: Float[Array, " n_sonar"],
     distance: Float[Array, ""],
     angle: Float[Array, ""],
+    steering: Float[Array, ""] | None = None,
 ) -> Float[Array, "2"]:
     """What the synapses of the left and of the right motor get while the robot is under way.
 
@@ -122,6 +142,7 @@ def motor_rewards(
         sonar: readings [px], from left to right, an odd number of them.
         distance: to the target [px].
         angle: from the heading to the target [deg], positive to the left.
+        steering: what the robot does [deg], positive to the left; only `commit` asks for it.
 
     Returns:
         Reward for the left and the right motor's synapses, `[2]`.
@@ -136,13 +157,47 @@ def motor_rewards(
     for_right = jnp.stack([r2, r1])
     zero = jnp.zeros_like(for_right)
     avoid = jnp.where(right < left, for_right, jnp.where(left < right, for_right[::-1], zero))
-    r3 = target_reward(params, distance)
+    if steering is not None:
+        ahead = sonar[half] <= jnp.minimum(left, right)
+        onwards = jnp.where(steering >= 0, for_right, for_right[::-1])
+        avoid = jnp.where(ahead & (params.commit > 0), onwards, avoid)
+    share = jnp.where(jnp.min(sonar) < params.d_safe, params.target_near_obstacle, 1.0)
+    r3 = share * target_reward(params, distance)
     region = angle_region(angle)
     on_right, on_left = region == 1, region == 3
     other = -params.opponent * r3
     to_left = jnp.where(on_right, r3, jnp.where(on_left, other, 0.0))
     to_right = jnp.where(on_left, r3, jnp.where(on_right, other, 0.0))
     return avoid + jnp.stack([to_left, to_right])
+
+
+def tempered(
+    params: RewardParams, reward: Float[Array, "2"], steering: Float[Array, ""]
+) -> Float[Array, "2"]:
+    r"""A reward for turning, less what the turn has already reached: a reward prediction error.
+
+    .. math:: r \leftarrow r \, \mathrm{clip}\left(1 - \frac{s \theta}{\theta_{goal}}, -1, 1\right),
+              \qquad s = \mathrm{sign}(r_{right} - r_{left})
+
+    The source rewards a turn for as long as an obstacle is near, whatever the robot does, and what
+    is rewarded grows without end. Here the turn settles at :math:`\theta_{goal}`, since a wider one
+    is pushed back. Rewards that are the same for both motors stay as they are.
+
+    Args:
+        params: RewardParams; `goal_angle` [deg], infinite for the source.
+        reward: for the synapses of the left and of the right motor.
+        steering: turn that goes with it [deg], positive to the left.
+
+    Source:
+        Ours; the delta rule of Widrow and Hoff (1960) with the sign of the source's rewards.
+
+    Example:
+        >>> params = RewardParams(goal_angle=60.0)
+        >>> tempered(params, jnp.array([-1.0, 1.0]), jnp.asarray(45.0)).tolist()
+        [-0.25, 0.25]
+    """
+    wanted = jnp.sign(reward[1] - reward[0])
+    return reward * jnp.clip(1.0 - wanted * steering / params.goal_angle, -1.0, 1.0)
 
 
 def terminal_reward(

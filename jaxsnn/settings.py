@@ -25,17 +25,29 @@ SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
     "tuned": {
         "config": {"control_steps": 200, "hold_steps": 100, "angle_code": "ring"},
         "params": {
-            "gamma": 1e-4,
-            "homeostasis": 0.02,
+            "gamma": 1.5e-4,
+            "centring": 1.0,
+            "homeostasis": 0.005,
             "rate_hidden": 25.0,
             "rate_output": 60.0,
         },
-        "stdp": {"anti_causal": 0.0},
-        "reward": {"opponent": 1.0},
+        "stdp": {"anti_causal": 0.5},
+        "reward": {
+            "opponent": 1.0,
+            "goal_angle": 60.0,
+            "commit": 1.0,
+            "target_near_obstacle": 0.0,
+            "d_target": 800.0,
+            "r3_base": 4.0,
+        },
     },
 }
-# The additive rule moves a weight by mV, the multiplicative one by a fraction of the weight.
-ADDITIVE_GAMMA = 3.0
+# Learning rates of the other networks relative to that of S4. The additive rule moves a weight by
+# mV and the multiplicative one by a fraction; inputs of S1 and S2 fire at 0.4 times the rate.
+GAMMA = {
+    "literal": {"S1": 3.0, "S2": 1.0, "S3": 3.0, "S4": 1.0},
+    "tuned": {"S1": 3.0, "S2": 1.0, "S3": 3.0, "S4": 1.0},
+}
 
 
 def network_setting(
@@ -67,8 +79,7 @@ def network_setting(
     base = SETTINGS[setting]
     built = network_config(network, **{**base["config"], **(config or {})})
     changes = dict(base["params"])
-    if built.rule == "additive":
-        changes["gamma"] *= ADDITIVE_GAMMA
+    changes["gamma"] *= GAMMA[setting][network]
     constants = network_params(built, **{**changes, **(params or {})})
     constants = constants._replace(
         stdp=STDPParams(**{**base["stdp"], **(stdp or {})}),

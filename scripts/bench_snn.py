@@ -35,8 +35,8 @@ class Bench:
     """Steps per window and per control step."""
     block: int = 8
     """Robots per block."""
-    control_steps: int = 8
-    """Control steps per timed call at 64 robots; other batches do as much work."""
+    control_steps: int = 64
+    """Control steps per timed call at 64 robots; other batches do as much work, in 16 or more."""
     repeats: int = 3
     """Timed calls; the median counts."""
     accuracy: bool = True
@@ -117,7 +117,8 @@ def window_program(robots: int, bench: Bench, control_steps: int) -> tuple[Any, 
 
 def bench_window(robots: int, bench: Bench) -> float:
     """Robot-ms per CPU-second of the window form in a closed loop."""
-    control_steps = max(2, bench.control_steps * 64 // robots)
+    # States are copied in and out once per call: with few control steps that would be measured.
+    control_steps = max(16, bench.control_steps * 64 // robots)
     run, (make, keys), config = window_program(robots, bench, control_steps)
     state, steps = run(make(keys), keys)
     held = [state]

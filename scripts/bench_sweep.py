@@ -37,7 +37,7 @@ class Config:
     """Files per measurement."""
     writers: tuple[int, ...] = (1, 2, 4, 8)
     """Processes that write at the same time."""
-    steps: int = 20_000
+    steps: int = 60_000
     """Steps per trial of the study that the workers run."""
     workers: tuple[int, ...] = (1, 2)
     """Worker processes of the measured sweep; empty skips it."""
@@ -115,6 +115,8 @@ def crowd_rates(folder: Path, writers: tuple[int, ...], repeats: int) -> dict[st
 
 def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str, Any]:
     """Wall and CPU seconds of one sweep with each number of worker processes."""
+    import xarray as xr  # before the clock runs
+
     from scripts import sweep
 
     found: dict[str, Any] = {}
@@ -125,6 +127,7 @@ def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str,
             out=folder / f"sweep{count}",
         )  # fmt: skip
         made = sweep.open_sweep(config)
+        sweep.summary(made)  # loads what gathering needs
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         own, start = time.process_time(), time.perf_counter()
         errors = sweep.run(config, made)
@@ -134,8 +137,6 @@ def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str,
         cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
         computed = sweep.summary(made)
         assert computed["complete"]
-        import xarray as xr
-
         with xr.open_dataset(made.out / "results.nc") as data:
             inside = float(data.attrs["compute_seconds"])
         found[str(count)] = {

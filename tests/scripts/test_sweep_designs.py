@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import doctest
+import importlib
+
 import numpy as np
 import pytest
 
@@ -128,3 +131,13 @@ def test_options_of_a_study() -> None:
     }
     with pytest.raises(ValueError, match="expected name=value"):
         parse_pairs(["x"], "slurm")
+
+
+@pytest.mark.parametrize(
+    "name",
+    ["_sweep.leaves", "_sweep.designs", "_sweep.study", "_sweep.program", "_sweep.halving", "sweep",
+     "bench_sweep"],
+)  # fmt: skip
+def test_examples(name) -> None:
+    result = doctest.testmod(importlib.import_module(f"scripts.{name}"))
+    assert result.attempted > 0 and result.failed == 0

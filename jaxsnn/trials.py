@@ -28,9 +28,11 @@ __all__ = [
     "TIMEOUT",
     "Experiment",
     "TrialResult",
+    "phase_keys",
     "run_experiment",
     "run_phase",
     "run_trial",
+    "start_states",
     "success_rate",
 ]
 
@@ -139,6 +141,20 @@ def _start(
     return world.reset(jax.random.fold_in(key, 2 * trial), place, circle=circle)
 
 
+def start_states(
+    key: Key[Array, ""],
+    place: world.Params,
+    n_trials: int,
+    circles: Int[Array, " trials"] | None = None,
+) -> world.State:
+    """Where `run_phase` puts the robot of this key at the beginning of each of its trials.
+
+    Returns:
+        world.State with leaves `[trials]`.
+    """
+    return jax.vmap(lambda i: _start(key, i, place, circles, n_trials))(jnp.arange(n_trials))
+
+
 def run_phase(
     agent: Agent,
     params: Any,
@@ -232,6 +248,11 @@ def run_trial(
     return jax.tree.map(lambda x: x[0], state), jax.tree.map(lambda x: x[0, 0], result)
 
 
+def phase_keys(key: Key[Array, ""]) -> Key[Array, " 4"]:
+    """Keys of a robot's first weights, learning, testing, and testing with plasticity left on."""
+    return jax.random.split(key, 4)
+
+
 class Experiment(NamedTuple):
     """A learning phase, a testing phase with frozen weights and, if asked for, one without."""
 
@@ -289,7 +310,7 @@ def run_experiment(
     test_place = place if test_place is None else test_place
 
     def run(robot_keys: Array, params: SNNParams, place: Any, test_place: Any) -> Experiment:
-        split = jax.vmap(lambda k: jax.random.split(k, 4))(robot_keys)
+        split = jax.vmap(phase_keys)(robot_keys)
         states = jax.vmap(learner.init, in_axes=(0, params_axis))(split[:, 0], params)
         axes = {"params_axis": params_axis, "place_axis": place_axis, "max_steps": max_steps}
         states, learning = run_phase(

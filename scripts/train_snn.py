@@ -22,6 +22,7 @@ from typing import Any, Literal
 from scripts import _run
 
 TEST_TRIALS = {1: 30, 2: 20, 3: 20}
+UNITS = {"n_mv": "steps", "path": "px", "path_ratio": "1", "path_ratio_median": "1"}
 TABLES = {1: "2.3", 2: "2.4", 3: "2.5"}
 
 
@@ -152,7 +153,51 @@ def mean_of_arrivals(record: dict[str, Any], field: str) -> float | None:
     return sum(values) / len(values) if values else None
 
 
-def metrics(records: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
+def shortest_paths(numbers: list[int], scenario: int, n_test: int) -> list[list[float]]:
+    """Shortest collision-free path from each testing start of each seed, to the arrival circle."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxsnn import planner, scenarios
+    from jaxsnn.trials import phase_keys, start_states
+
+    place = scenarios.scenario(scenario)
+
+    @jax.jit
+    def starts(seeds: Any) -> Any:
+        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(0), i))(seeds)
+        found = jax.vmap(lambda k: start_states(phase_keys(k)[2], place, n_test))(keys)
+        return jnp.stack([found.x, found.y], axis=-1)
+
+    field = planner.path_field(place)
+    positions = np.asarray(starts(jnp.asarray(numbers, jnp.int32)), np.float64)
+    return [field.lengths(p).tolist() for p in positions]
+
+
+def path_ratios(
+    records: list[dict[str, Any]], shortest: list[list[float]]
+) -> tuple[list[float], list[float]]:
+    """Mean and median over the testing trials that arrived of path / shortest, per seed."""
+    import numpy as np
+
+    means, medians = [], []
+    for record, lengths in zip(records, shortest, strict=True):
+        test = record["testing"]
+        ratio = [
+            path / length
+            for path, length, status in zip(test["path"], lengths, test["status"], strict=True)
+            if status == 0
+        ]
+        if ratio:
+            means.append(float(np.mean(ratio)))
+            medians.append(float(np.median(ratio)))
+    return means, medians
+
+
+def metrics(
+    records: list[dict[str, Any]], shortest: list[list[float]] | None = None
+) -> dict[str, dict[str, Any]]:
     """Mean, interval and values over seeds of what the source reports, and the path's length."""
     columns: dict[str, list[float | None]] = {
         "sr_learning": [success(r, "learning") for r in records],
@@ -162,6 +207,9 @@ def metrics(records: list[dict[str, Any]]) -> dict[str, dict[str, Any]]:
     }
     if "online" in records[0]:
         columns["sr_online"] = [success(r, "online") for r in records]
+    if shortest is not None:
+        means, medians = path_ratios(records, shortest)
+        columns["path_ratio"], columns["path_ratio_median"] = list(means), list(medians)
     kept = {k: [v for v in values if v is not None] for k, values in columns.items()}
     return {name: _run.summarize(values) for name, values in kept.items() if values}
 
@@ -233,7 +281,8 @@ def main(config: TrainSnn) -> dict[str, Any]:
             rate = sum(success(r, "testing") for r in records) / len(records)
             bar.update(task, advance=len(numbers), status=f"SR-testing {rate:.0f} %")
 
-    summary = metrics(records)
+    shortest = shortest_paths([r["seed"] for r in records], config.scenario, n_test)
+    summary = metrics(records, shortest)
     if config.figures and shown is not None:
         draw(out, config, shown, records)
     _run.write_json(out / "result.json", {"settings": settings, "metrics": summary})
@@ -244,7 +293,7 @@ def main(config: TrainSnn) -> dict[str, Any]:
         model = config.network if config.setting == "tuned" else f"{config.network} literal"
         rows = [
             {"row": f"Scenario {config.scenario}", "model": model, "metric": metric,
-             "unit": {"n_mv": "steps", "path": "px"}.get(metric, "%"), **values,
+             "unit": UNITS.get(metric, "%"), **values,
              **({"source": source[metric]} if metric in source else {})}
             for metric, values in summary.items()
         ]  # fmt: skip

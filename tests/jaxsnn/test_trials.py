@@ -20,6 +20,7 @@ from jaxsnn.trials import (
     run_experiment,
     run_phase,
     run_trial,
+    start_states,
     success_rate,
 )
 
@@ -88,6 +89,9 @@ def test_statuses_steps_and_paths(phase):
     np.testing.assert_array_equal(state[:, 0], seek.steps.sum(1))  # acted while under way, only
     np.testing.assert_array_equal(state[:, 1], seek.steps.sum(1))
 
+    begin = jax.vmap(lambda k: start_states(k, PLACE, 4))(keys(3))
+    np.testing.assert_array_equal(begin.x, seek.poses[:, :, 0, 0])
+    np.testing.assert_array_equal(begin.heading, seek.poses[:, :, 0, 2])
     poses, steps = np.asarray(seek.poses), np.asarray(seek.steps)
     for robot in range(3):
         for trial in range(4):

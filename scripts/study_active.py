@@ -39,6 +39,8 @@ class Config:
     seed: int = 0
     out: Path = Path("runs/study_active")
     """Folder of the pictures."""
+    record: Path = _run.RESULTS / "study_active.json"
+    """File of the numbers; rows of other circuits and specifications stay."""
 
 
 def held_samples(folder: Path, limit: int) -> tuple[Any, Any]:
@@ -125,7 +127,7 @@ def main(config: Config) -> dict[str, Any]:
 
     circuit = circuits.get(config.circuit)
     names = config.specs or circuit.spec_names
-    path = _run.RESULTS / "study_active.json"
+    path = config.record
     held: list[dict[str, Any]] = []
     if path.exists():
         held = json.loads(path.read_text(encoding="utf-8"))["rows"]

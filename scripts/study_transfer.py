@@ -152,7 +152,7 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
     reached = np.stack(columns) >= 0.9
     first = [float(CHECKPOINTS[r.argmax()]) for r in reached.T if r.any()]
     values["trials_to_90"] = first
-    values["share_reaching_90"] = (100.0 * reached.any(axis=0)).tolist()
+    values["share_reaching_90"] = [100.0 * float(r.any()) for r in reached.T]
     return values
 
 

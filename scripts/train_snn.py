@@ -89,7 +89,7 @@ def parse_changes(changes: tuple[str, ...]) -> dict[str, dict[str, Any]]:
 
 def make_runner(
     config: Any, scenario: int, *, n_learn: int, n_test: int, n_online: int, max_steps: int,
-    block: int, record: bool,
+    block: int, record: bool, keep_states: bool = False,
 ) -> Any:  # fmt: skip
     """A compiled `(seeds, params) -> Experiment` of numpy arrays; a change of params is free."""
     import jax
@@ -110,7 +110,7 @@ def make_runner(
         return run_experiment(
             config, snn_params(config, params), place, keys,
             n_learn=n_learn, n_test=n_test, n_online=n_online, max_steps=max_steps, block=block,
-            circles=circles, record=record,
+            circles=circles, record=record, keep_states=keep_states,
         )  # fmt: skip
 
     def call(numbers: Any, params: Any) -> Any:

@@ -278,3 +278,15 @@ def test_gather_of_an_empty_folder_is_all_missing(tmp_path) -> None:
     assert done_chunks(held_sweep(tmp_path)) == set()
     assert chunks.next_rung(held_sweep(tmp_path)).budget is None
     assert run_shard(held_sweep(tmp_path), shard=0, shards=24) is False
+
+
+def test_the_study_of_the_page(tmp_path, monkeypatch) -> None:
+    """The page's example of a study of one's own is one."""
+    page = (Path(sweep.__file__).parent.parent / "docs" / "sweeps.md").read_text()
+    blocks = [part.split("```")[0] for part in page.split("```python\n")[1:]]
+    (code,) = [block for block in blocks if "def make" in block]
+    (tmp_path / "my_study.py").write_text(code)
+    monkeypatch.syspath_prepend(tmp_path)
+    config = sweep.Config(study="my_study:make", grid=("width=1,3",), seeds=4, quiet=True)
+    data = run(config, tmp_path / "out", chunk_size="4")
+    assert (data["spread"].sel(width=3.0) > 1.5 * data["spread"].sel(width=1.0).mean()).all()

@@ -329,3 +329,17 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
         read_layouts(tmp_path / "none")
     with pytest.raises(ValueError, match="no object with a 3D box"):
         read_layouts(tmp_path)
+
+
+@pytest.mark.data
+def test_layouts_of_real_labels_make_scenes(data_dir: Path) -> None:
+    layouts = read_layouts(data_dir / "kitti" / "training" / "label_2")
+    assert len(layouts) >= 20
+    rng = np.random.default_rng(0)
+    for i in range(len(layouts)):
+        room = {"max_objects": SCENES.max_objects, "max_look_alikes": SCENES.max_look_alikes}
+        things = compose(rng, layouts[i], layouts[i - 1], **room)
+        scene = build_scene(rng, things, SCENES)
+        n = len(things)
+        np.testing.assert_allclose(height_above(scene.plane, scene.place[:n]), 0.0, atol=1e-4)
+        assert np.isfinite(np.concatenate([leaf.ravel() for leaf in scene])).all()

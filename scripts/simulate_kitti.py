@@ -7,9 +7,10 @@
 files are not needed); without it they come from a model fitted to those. Writes
 `OUT/training/{image_2,velodyne,calib,label_2,planes}`, `OUT/ImageSets/{train,val,test}.txt`, for
 each frame a table of what each sensor saw (`training/visibility`), and `simulation.json`. Layouts
-of the three lists differ. Some 0.25 CPU-seconds a frame for `small` (320x96 pixels, a third of the
-lidar's shots), 1 for `paper` (1242x375), after 15 seconds of compiling. `--resume` goes on with a
-run that was cut off. Last line: `result: frames=... cars=... points_per_frame=...`.
+of the three lists differ. Some 0.15 CPU-seconds a frame for `small` (320x96 pixels, a third of the
+lidar's shots), after 8 seconds of compiling; `paper` (1242x375, all shots) casts four times as many
+rays. `--resume` goes on with a run that was cut off. Last line:
+`result: frames=... cars=... points_per_frame=...`.
 
 `--picture FILE.png` draws the first four training frames: image with boxes, bird's-eye view.
 """

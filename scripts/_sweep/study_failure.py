@@ -102,7 +102,7 @@ def make(
         }
         if threshold is not None:
             failed = valid & (y > sign * threshold)
-            out["hit"] = 100.0 * jnp.any(failed)
+            out["hit"] = jnp.where(jnp.any(failed), 100.0, 0.0)
             number = (jnp.argmax(failed) + 1).astype(y.dtype)
             out["first_hit"] = jnp.where(jnp.any(failed), number, jnp.nan)
         return out

@@ -1,14 +1,15 @@
 """Spiking networks that learn to steer a robot by reward-modulated STDP, and the robot's world.
 
 Kernels: `neurons`, `plasticity`, `window`. Network: `encoding`, `rewards`, `architecture`,
-`network`, `settings`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`. All together:
-`agents`, `trials`, `qlearning`. Imported by name only, for what they bring along: `jaxsnn.ppo`
-(flax, optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
+`baseline`, `network`, `settings`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`. All
+together: `agents`, `trials`, `qlearning`. Imported by name only, for what they bring along: `jaxsnn.ppo`
+and `jaxsnn.navigation` (flax, optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
 """
 
 from jaxsnn import (
     agents,
     architecture,
+    baseline,
     encoding,
     geometry,
     maps,
@@ -39,6 +40,7 @@ __all__ = [
     "agents",
     "apply_reward",
     "architecture",
+    "baseline",
     "encoding",
     "geometry",
     "lif_step",

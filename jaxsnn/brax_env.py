@@ -2,8 +2,8 @@
 brax.
 
 One robot is one environment; brax's wrappers vmap it. The observation, the reward and the meaning
-of an action are those of :func:`jaxsnn.ppo.navigation_env`. Importing brax takes seconds and prints
-two lines to stdout, so nothing else in the package imports this module.
+of an action are those of :func:`jaxsnn.navigation.navigation_env`. Importing brax takes seconds and
+prints two lines to stdout, so nothing else in the package imports this module.
 
 >>> from jaxsnn import scenarios
 >>> from jaxsnn.brax_env import NavigationEnv  # doctest: +SKIP
@@ -22,7 +22,7 @@ from brax.envs.base import Env, State, Wrapper
 from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
 from jaxtyping import Array
 
-from jaxsnn import ppo, world
+from jaxsnn import navigation, world
 
 __all__ = ["FreshResetWrapper", "NavigationEnv", "brax_compatibility", "wrap_for_training"]
 
@@ -56,8 +56,8 @@ def _unpack(robot: world.State) -> world.State:
 class NavigationEnv(Env):
     """One robot on one map.
 
-    Observation ``[8]``: :func:`jaxsnn.ppo.observation`. Action ``[1]`` in [-1, 1]: 1 steers 45
-    degrees to the left. Reward: :func:`jaxsnn.ppo.navigation_reward`. ``done`` is 1.0 after
+    Observation ``[8]``: :func:`jaxsnn.navigation.observation`. Action ``[1]`` in [-1, 1]: 1 steers
+    45 degrees to the left. Reward: :func:`jaxsnn.navigation.navigation_reward`. ``done`` is 1.0 after
     arrival, collision or a state that is not finite; ``metrics`` say which. The limit on steps is
     brax's ``episode_length``.
 
@@ -74,7 +74,7 @@ class NavigationEnv(Env):
         zero = jnp.zeros((), jnp.float32)
         return State(
             pipeline_state=PipelineState(_pack(robot), self.params),
-            obs=ppo.observation(world.observe(robot, self.params), self.params),
+            obs=navigation.observation(world.observe(robot, self.params), self.params),
             reward=zero,
             done=zero,
             metrics={"arrived": zero, "collided": zero, "failed": zero},
@@ -85,7 +85,7 @@ class NavigationEnv(Env):
         """One control step of 15 pixels."""
         held: Any = state.pipeline_state
         before, params = _unpack(held.robot), held.params
-        steering = ppo.STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
+        steering = navigation.STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
         robot, outcome = world.step(before, steering, params)
         flags = {
             name: jnp.asarray(getattr(outcome, name)).astype(jnp.float32)
@@ -93,8 +93,8 @@ class NavigationEnv(Env):
         }
         return state.replace(
             pipeline_state=PipelineState(_pack(robot), params),
-            obs=ppo.observation(world.observe(robot, params), params),
-            reward=ppo.navigation_reward(before, robot, outcome, params),
+            obs=navigation.observation(world.observe(robot, params), params),
+            reward=navigation.navigation_reward(before, robot, outcome, params),
             done=flags["arrived"] + flags["collided"] + flags["failed"],
             metrics={**state.metrics, **flags},
         )
@@ -102,7 +102,7 @@ class NavigationEnv(Env):
     @property
     def observation_size(self) -> int:
         """Five sonars, distance, sine and cosine of the angle."""
-        return ppo.OBSERVATION_SIZE
+        return navigation.OBSERVATION_SIZE
 
     @property
     def action_size(self) -> int:

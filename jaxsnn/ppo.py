@@ -1,12 +1,12 @@
 """Proximal policy optimization in one compiled program: the modern reference on the same world.
 
 ``make_train(config, env)`` gives ``train(key)``, a pure function of a key: vmap it over seeds, jit
-it as a whole. Environments are pairs of pure functions (:class:`Env`); :func:`navigation_env` wraps
-the robot world. Robots that end a trial start the next one at once, from a fresh random start.
+it as a whole. Environments are pairs of pure functions (:class:`Env`); :mod:`jaxsnn.navigation`
+is the robot world as one. Robots that end a trial start the next one at once, from a fresh start.
 
 >>> import jax
->>> from jaxsnn import ppo, scenarios
->>> env = ppo.navigation_env(scenarios.scenario(1))
+>>> from jaxsnn import navigation, ppo, scenarios
+>>> env = navigation.navigation_env(scenarios.scenario(1))
 >>> train = jax.jit(ppo.make_train(ppo.Config(n_updates=100), env))
 >>> result = train(jax.random.key(0))  # doctest: +SKIP
 """
@@ -24,8 +24,6 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Key
 
-from jaxsnn import world
-
 __all__ = [
     "ActorCritic",
     "Config",
@@ -37,14 +35,7 @@ __all__ = [
     "evaluate",
     "gae",
     "make_train",
-    "navigation_env",
-    "navigation_reward",
-    "observation",
 ]
-
-OBSERVATION_SIZE = world.N_SONARS + 3
-# A full action turns the robot by this much [deg].
-STEERING_SCALE = 45.0
 
 
 class Transition(NamedTuple):
@@ -325,76 +316,6 @@ def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
     return train
 
 
-# --- the robot world as an environment ---------------------------------------------------------
-
-
-class _Navigation(NamedTuple):
-    robot: world.State
-    length: Array  # path so far [px]
-    start: Array  # [2]
-
-
-def observation(reading: world.Reading, params: world.Params) -> Float[Array, "8"]:
-    """Readings in [-1, 1]: five sonars, the distance, and sine and cosine of the angle."""
-    angle = jnp.deg2rad(reading.angle)
-    rest = [reading.distance / params.distance_range, jnp.sin(angle), jnp.cos(angle)]
-    return jnp.concatenate([reading.sonar / params.sonar_range, jnp.stack(rest)])
-
-
-def navigation_reward(
-    before: world.State, after: world.State, outcome: world.Outcome, params: world.Params
-) -> Float[Array, ""]:
-    r"""Arrival +2, collision -2, and one for each 100 px that the target comes nearer.
-
-    .. math:: r = 2\,[\text{arrived}] - 2\,[\text{collided}] + (d_t - d_{t+1}) / 100
-
-    The last term sums to the distance covered towards the target and so favours no detour.
-    """
-
-    def distance(state: world.State) -> Array:
-        return jnp.hypot(params.target[0] - state.x, params.target[1] - state.y)
-
-    ends = jnp.where(outcome.arrived, 2.0, 0.0) - jnp.where(outcome.collided, 2.0, 0.0)
-    progress = (distance(before) - distance(after)) / 100.0
-    return ends.astype(progress.dtype) + progress
-
-
-def navigation_env(params: world.Params, *, max_steps: int = 200) -> Env:
-    """The robot world as an :class:`Env`; an action of 1 steers 45 degrees to the left.
-
-    Args:
-        params: the map.
-        max_steps: a trial that has not ended after so many control steps is truncated.
-
-    Raises:
-        ValueError: ``max_steps`` is below 1.
-    """
-    if max_steps < 1:
-        raise ValueError(f"max_steps = {max_steps} must be at least 1")
-
-    def reset(key: Array) -> tuple[_Navigation, Array]:
-        robot = world.reset(key, params)
-        obs = observation(world.observe(robot, params), params)
-        start = jnp.stack([robot.x, robot.y])
-        return _Navigation(robot, jnp.zeros_like(robot.x), start), obs
-
-    def step(state: _Navigation, action: Array) -> Transition:
-        steering = STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
-        robot, outcome = world.step(state.robot, steering, params)
-        terminated = outcome.arrived | outcome.collided
-        moved = jnp.hypot(robot.x - state.robot.x, robot.y - state.robot.y)
-        return Transition(
-            state=state._replace(robot=robot, length=state.length + moved),
-            obs=observation(world.observe(robot, params), params),
-            reward=navigation_reward(state.robot, robot, outcome, params),
-            terminated=terminated,
-            truncated=(robot.t >= max_steps) & ~terminated,
-            success=outcome.arrived,
-        )
-
-    return Env(reset, step, action_size=1)
-
-
 def evaluate(
     config: Config, env: Env, params: Any, keys: Key[Array, "n"], *, max_steps: int
 ) -> tuple[Any, Array, Array]:
@@ -402,7 +323,8 @@ def evaluate(
 
     Args:
         config: the one that the parameters were trained with.
-        env: the environment, a :func:`navigation_env` for the path lengths to make sense.
+        env: the environment; path lengths make sense with a
+            :func:`jaxsnn.navigation.navigation_env`.
         params: ``Result.params``.
         keys: one for each episode.
         max_steps: steps to scan; the environment's own limit or more.

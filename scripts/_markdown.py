@@ -166,7 +166,7 @@ def comparisons(study: Table, table: Table | None) -> str:
     printed = {
         (row["row"], row["model"]): row["source"]
         for row in (table or {}).get("rows", ())
-        if row["metric"] == "accuracy" and "source" in row
+        if row["metric"] in ("accuracy", "sr_testing") and "source" in row
     }
     lines, gaps = [], []
     for row in study["rows"]:

@@ -137,7 +137,7 @@ def run_ppo(config: Config, number: int) -> dict[str, list[float]]:
     import jax.numpy as jnp
     import numpy as np
 
-    from jaxsnn import ppo, scenarios, world
+    from jaxsnn import navigation, ppo, scenarios, world
 
     settings = ppo.Config(n_updates=150 if config.preset == "paper" else 30)
     if config.learning_rate is not None:
@@ -148,7 +148,7 @@ def run_ppo(config: Config, number: int) -> dict[str, list[float]]:
 
     # The map is an argument, so that all scenarios share one compiled program.
     def one(key: jax.Array, params: world.Params) -> tuple[Any, ...]:
-        env = ppo.navigation_env(params, max_steps=config.max_steps)
+        env = navigation.navigation_env(params, max_steps=config.max_steps)
         k_train, k_test = jax.random.split(key)
         result = ppo.make_train(settings, env)(k_train)
         keys = jax.random.split(k_test, config.test_trials)

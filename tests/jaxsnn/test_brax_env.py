@@ -11,7 +11,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsnn import ppo, scenarios, world
+from jaxsnn import navigation, scenarios, world
 
 # brax mixes dtypes and warns about its optional engines as it is imported.
 pytestmark = [pytest.mark.relaxed, pytest.mark.filterwarnings("ignore")]
@@ -54,7 +54,7 @@ def test_env_agrees_with_the_world_and_with_our_own_env(env: Any) -> None:
     key = jax.random.key(3)
     raw, typed = env.reset(jax.random.key_data(key)), env.reset(key)
     np.testing.assert_array_equal(raw.obs, typed.obs)
-    own = ppo.navigation_env(params)
+    own = navigation.navigation_env(params)
     state, obs = own.reset(key)
     np.testing.assert_allclose(raw.obs, obs)
     action = jnp.asarray([0.5])

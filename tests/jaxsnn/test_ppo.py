@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsnn import ppo, scenarios
+from jaxsnn import navigation, ppo, scenarios
 
 
 def test_advantages_in_closed_form() -> None:
@@ -83,7 +83,7 @@ def test_it_finds_the_known_best_action_and_value() -> None:
 @pytest.mark.relaxed  # optax, as above
 def test_robots_learn_to_arrive_in_scenario_1() -> None:
     config = ppo.Config(n_envs=8, n_steps=64, n_updates=40)
-    env = ppo.navigation_env(scenarios.scenario(1), max_steps=100)
+    env = navigation.navigation_env(scenarios.scenario(1), max_steps=100)
 
     @jax.jit
     def run(key: jax.Array) -> tuple[ppo.Rollout, jax.Array, jax.Array]:
@@ -108,4 +108,4 @@ def test_sizes_that_do_not_fit_are_refused() -> None:
     with pytest.raises(ValueError, match="learning_rate = -1"):
         ppo.Config(learning_rate=-1.0)
     with pytest.raises(ValueError, match="max_steps = 0"):
-        ppo.navigation_env(scenarios.scenario(1), max_steps=0)
+        navigation.navigation_env(scenarios.scenario(1), max_steps=0)

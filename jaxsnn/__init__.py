@@ -2,8 +2,9 @@
 
 Kernels: `neurons`, `plasticity`, `window`. Network: `encoding`, `rewards`, `architecture`,
 `baseline`, `network`, `settings`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`. All
-together: `agents`, `trials`, `qlearning`. Imported by name only, for what they bring along: `jaxsnn.ppo`
-and `jaxsnn.navigation` (flax, optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
+together: `agents`, `trials`, `qlearning`. Imported by name only, for what they bring along:
+`jaxsnn.ppo` and `jaxsnn.navigation` (flax, optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env`
+(brax).
 """
 
 from jaxsnn import (

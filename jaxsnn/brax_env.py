@@ -58,8 +58,8 @@ class NavigationEnv(Env):
 
     Observation ``[8]``: :func:`jaxsnn.navigation.observation`. Action ``[1]`` in [-1, 1]: 1 steers
     45 degrees to the left. Reward: :func:`jaxsnn.navigation.navigation_reward`. ``done`` is 1.0
-    after arrival, collision or a state that is not finite; ``metrics`` say which. The limit on steps is
-    brax's ``episode_length``.
+    after arrival, collision or a state that is not finite; ``metrics`` say which. The limit on
+    steps is brax's ``episode_length``.
 
     Args:
         params: the map; it travels in ``pipeline_state`` and may be changed there.

@@ -71,8 +71,8 @@ class Detector(nn.Module):
         self, image: Float[Array, "b h w 3"], bev: Float[Array, "b r c s"], train: bool
     ) -> Encoded:
         """Maps of both views and the fusion weights (0.5 each without a gate)."""
-        camera = self.views[0](image, train)
-        lidar = self.views[1](bev, train)
+        camera = _teach_if_alive(self.views[0](image, train), image)
+        lidar = _teach_if_alive(self.views[1](bev, train), bev)
         maps = (nn.relu(self.reduce[0](camera)), nn.relu(self.reduce[1](lidar)))
         if self.config.model == "avod_argate":
             weights = self.gate(maps)
@@ -95,6 +95,17 @@ class Detector(nn.Module):
         self.rpn(jnp.zeros((1, c.rpn_crop, c.rpn_crop, 1)), False)
         self.second(jnp.zeros((1, c.second_crop, c.second_crop, c.widths[0])), False)
         return encoded
+
+
+def _teach_if_alive(features: Array, reading: Array) -> Array:
+    """Features that pass no gradient where the sensor's reading is one constant.
+
+    A dead sensor teaches its view nothing, but normalization of maps without variance multiplies
+    the gradient by some 30 in each layer, which no clipping of the sum mends.
+    """
+    axes = (1, 2, 3)
+    alive = reading.max(axis=axes, keepdims=True) > reading.min(axis=axes, keepdims=True)
+    return jnp.where(alive, features, jax.lax.stop_gradient(features))
 
 
 class AuxiliaryHeads(nn.Module):

@@ -44,9 +44,9 @@ class MapGate(nn.Module):
 
     .. math:: w = N\Big(W_o \, \mathrm{relu}\big(\textstyle\sum_k W_k p_k + b_k\big) + b_o\Big)
 
-    :math:`p_k` are the mean and the maximum over the map of view k after two strided convolutions,
-    :math:`N` the normalizer. `init_detector` starts the last layer at zero, that is from equal
-    weights, as AVOD fuses.
+    :math:`p_k` are mean and standard deviation over the map of view k after two strided
+    convolutions, :math:`N` the normalizer. `init_detector` starts the last layer at zero, that is
+    from equal weights, as AVOD fuses.
 
     Source: M. S. Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
     """
@@ -62,7 +62,8 @@ class MapGate(nn.Module):
             for i, features in enumerate((8, 16)):
                 conv = nn.Conv(features, (5, 5), strides=(4, 4), name=f"view{k}_conv{i}")
                 x = nn.relu(conv(x))
-            pooled = jnp.concatenate([x.mean(axis=(1, 2)), x.max(axis=(1, 2))], axis=-1)
+            spread = jnp.sqrt(x.var(axis=(1, 2)) + 1e-6)
+            pooled = jnp.concatenate([x.mean(axis=(1, 2)), spread], axis=-1)
             hidden = hidden + nn.Dense(self.width, name=f"view{k}")(pooled)
         last = nn.Dense(len(maps), name="fusion")
         return normalize(last(nn.relu(hidden)), self.normalizer)

@@ -57,5 +57,6 @@ def draw_weights(
             out.append(sd * noise[end - size : end].reshape(leaf.shape))
         else:
             one = name[-1] in ("scale", "var")
-            out.append(jnp.full(leaf.shape, 1.0 if one else 0.0))
+            # An explicit dtype: a weak one would change after the first step, and compile it again.
+            out.append(jnp.full(leaf.shape, 1.0 if one else 0.0, leaf.dtype))
     return jax.tree_util.tree_unflatten(tree, out)

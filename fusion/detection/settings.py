@@ -132,7 +132,7 @@ def detector_preset(name: str, model: str = "avod_argate") -> DetectorConfig:
         return dataclasses.replace(
             base,
             bev=BevConfig(x_range=(-22.0, 22.0), z_range=(2.0, 46.0), cell=0.25),
-            anchors=AnchorConfig(CAR_SIZES, max_anchors=4096),
+            anchors=AnchorConfig(CAR_SIZES, max_anchors=12_288),
             image_size=(96, 320),
             max_points=20_480,
             max_objects=16,

@@ -143,7 +143,11 @@ def init_training(
 
 
 def fail_sensor(
-    key: PRNGKeyArray, example: Example, config: DetectorConfig, failure: str, severity: float
+    key: PRNGKeyArray,
+    example: Example,
+    config: DetectorConfig,
+    failure: str,
+    severity: float | Array = 1.0,
 ) -> Inputs:
     """Inputs of one frame of which one sensor has failed, for tests of robustness.
 

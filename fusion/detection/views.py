@@ -64,7 +64,18 @@ class _Block(nn.Module):
 def _normalize(norm: str, train: bool) -> nn.Module:
     if norm == "batch":
         return nn.BatchNorm(use_running_average=not train, momentum=0.99, name="norm")
-    return nn.GroupNorm(num_groups=None, group_size=GROUP_SIZE, name="norm")
+    return nn.GroupNorm(num_groups=None, group_size=GROUP_SIZE, epsilon=1e-3, name="norm")
+
+
+def _halve(x: Array, axis: int) -> Array:
+    """Maxima of neighbours along one axis.
+
+    Not a reduction: its gradient divides by the number of elements that equal the maximum, and a
+    compiler that recomputes them with other rounding finds none, so that the gradient is NaN.
+    """
+    pairs = x.reshape(*x.shape[:axis], -1, 2, *x.shape[axis + 1 :])
+    first, second = (jax.lax.index_in_dim(pairs, i, axis + 1, keepdims=False) for i in (0, 1))
+    return jnp.maximum(first, second)
 
 
 class FeaturePyramid(nn.Module):
@@ -90,8 +101,7 @@ class FeaturePyramid(nn.Module):
         for level, (features, n) in enumerate(zip(self.widths, self.layers, strict=True)):
             if level:
                 skips.append(x)
-                b, h, w, c = x.shape
-                x = x.reshape(b, h // 2, 2, w // 2, 2, c).max(axis=(2, 4))
+                x = _halve(_halve(x, 1), 2)
             for i in range(n):
                 x = _Block(features, self.norm, name=f"encoder{level}_{i}")(x, train)
         for level in reversed(range(len(skips))):

@@ -1,0 +1,190 @@
+"""Frames prepared once: examples of fixed size on disk, anchor sizes from the labels, counts.
+
+A cache folder holds `000000.npz` for each frame and `cache.json` with preset, splits, anchor sizes
+and what was left out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion.detection.anchors import cluster_sizes
+from fusion.detection.examples import Example, make_example
+from fusion.detection.io import frame_names, read_frame, read_labels, read_split
+from fusion.detection.settings import CAR_SIZES, DetectorConfig, detector_preset
+
+__all__ = ["Cache", "open_cache", "prepare_cache", "read_example", "split_frames", "write_example"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Cache:
+    """What `cache.json` says.
+
+    Attributes:
+        folder: where the examples are.
+        root: folder of the frames it was made from.
+        preset: of the detector; decides the sizes of all arrays.
+        splits: split name -> frame names.
+        sizes: anchor sizes [m], from the training labels.
+        counts: frames fitted, skipped, missing; points and labels left out.
+    """
+
+    folder: Path
+    root: Path
+    preset: str
+    splits: dict[str, tuple[str, ...]]
+    sizes: tuple[tuple[float, float, float], ...]
+    counts: dict[str, Any]
+
+    def config(self, model: str) -> DetectorConfig:
+        """The preset of the detector with this cache's anchor sizes."""
+        base = detector_preset(self.preset, model)
+        return dataclasses.replace(
+            base, anchors=dataclasses.replace(base.anchors, sizes=self.sizes)
+        )
+
+    def read(self, split: str) -> list[Example]:
+        """All examples of a split, in memory."""
+        return [read_example(self.folder, name) for name in self.splits[split]]
+
+
+def write_example(folder: Path, name: str, example: Example) -> None:
+    """Write one example; a reader sees the whole file or none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f".{name}.npz"
+    with temporary.open("wb") as file:
+        arrays: dict[str, Any] = {k: np.asarray(v) for k, v in example._asdict().items()}
+        np.savez(file, **arrays)
+    os.replace(temporary, folder / f"{name}.npz")
+
+
+def read_example(folder: Path, name: str) -> Example:
+    """Read one example. Raises FileNotFoundError when it was not prepared."""
+    path = folder / f"{name}.npz"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: run `prepare` first")
+    with np.load(path) as held:
+        return Example(*(held[field] for field in Example._fields))
+
+
+def split_frames(root: Path, splits: Sequence[str]) -> tuple[dict[str, tuple[str, ...]], int]:
+    """Frames of each split list that are on disk, and how many listed ones are not.
+
+    Raises:
+        FileNotFoundError: a list or the image folder is missing.
+        ValueError: none of a list's frames is there.
+    """
+    images = set(frame_names(root / "training" / "image_2", ".png"))
+    found: dict[str, tuple[str, ...]] = {}
+    missing = 0
+    for split in splits:
+        listed = read_split(root / "ImageSets" / f"{split}.txt")
+        found[split] = tuple(name for name in listed if name in images)
+        missing += len(listed) - len(found[split])
+        if not found[split]:
+            raise ValueError(
+                f"{root}: none of the {len(listed)} frames of ImageSets/{split}.txt has an image "
+                "in training/image_2"
+            )
+    return found, missing
+
+
+def _anchor_sizes(
+    root: Path, names: Sequence[str], n_sizes: int
+) -> tuple[tuple[float, float, float], ...]:
+    sizes = [np.zeros((0, 3))]
+    for name in names:
+        labels = read_labels(root / "training" / "label_2" / f"{name}.txt")
+        cars = (labels.type == "Car") & (labels.dimensions > 0).all(axis=1)
+        sizes.append(labels.dimensions[cars][:, [2, 1, 0]])
+    cars = np.concatenate(sizes)
+    # Clusters of a handful of cars mean nothing; the benchmark's own are the better guess.
+    if len(np.unique(cars, axis=0)) < 20 * n_sizes:
+        return CAR_SIZES[-n_sizes:]
+    centres = np.round(cluster_sizes(cars, n_sizes), 3)
+    return tuple((float(a), float(b), float(c)) for a, b, c in centres)
+
+
+def prepare_cache(
+    root: Path,
+    folder: Path,
+    preset: str,
+    *,
+    splits: Sequence[str] = ("train", "val"),
+    any_size: bool = False,
+    skip_bad: bool = False,
+    on_frame: Callable[[int, int, str], None] | None = None,
+) -> Cache:
+    """Read every frame of the split lists, check it, and write its example.
+
+    Args:
+        root: KITTI folder (`training`, `ImageSets`).
+        folder: of the cache.
+        preset: of the detector.
+        splits: lists to read; the first one gives the anchor sizes.
+        any_size: accept images of other sizes than the benchmark's.
+        skip_bad: leave out frames that cannot be used, and count them, instead of stopping.
+        on_frame: called with (done, all, name).
+
+    Raises:
+        FileNotFoundError: a folder, list or (unless `skip_bad`) a file of a frame is missing.
+        ValueError: (unless `skip_bad`) a frame is damaged; or nothing is left of a split.
+    """
+    config = detector_preset(preset)
+    found, missing = split_frames(root, splits)
+    everything = sorted({name for names in found.values() for name in names})
+    counts: dict[str, Any] = {
+        "missing": missing, "skipped": {}, "plane_fitted": 0, "points_dropped": 0,
+        "labels_dropped": 0,
+    }  # fmt: skip
+    for done, name in enumerate(everything):
+        try:
+            example, left_out = make_example(read_frame(root, name, any_size=any_size), config)
+        except (ValueError, FileNotFoundError) as error:
+            if not skip_bad:
+                raise
+            counts["skipped"][name] = str(error)
+            continue
+        for key, value in left_out.items():
+            counts[key] += int(value)
+        write_example(folder, name, example)
+        if on_frame is not None:
+            on_frame(done + 1, len(everything), name)
+    kept = {
+        split: tuple(name for name in names if name not in counts["skipped"])
+        for split, names in found.items()
+    }
+    for split, names in kept.items():
+        if not names:
+            first = next(iter(counts["skipped"].values()))
+            raise ValueError(f"every frame of the split {split} was skipped; the first: {first}")
+    sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes))
+    cache = Cache(folder, root, preset, kept, sizes, counts)
+    record = dataclasses.asdict(cache) | {"folder": str(folder), "root": str(root)}
+    temporary = folder / ".cache.json"
+    temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    os.replace(temporary, folder / "cache.json")
+    return cache
+
+
+def open_cache(folder: Path) -> Cache:
+    """Read `cache.json`. Raises FileNotFoundError when there is none."""
+    path = folder / "cache.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: run `prepare` first")
+    held = json.loads(path.read_text(encoding="utf-8"))
+    return Cache(
+        folder=folder,
+        root=Path(held["root"]),
+        preset=held["preset"],
+        splits={split: tuple(names) for split, names in held["splits"].items()},
+        sizes=tuple((a, b, c) for a, b, c in held["sizes"]),
+        counts=held["counts"],
+    )

@@ -1,0 +1,50 @@
+"""Checkpoints of a training and its history, by orbax (loaded when one is wanted)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
+
+__all__ = ["Checkpoints"]
+
+
+class Checkpoints:
+    """A folder of checkpoints, of which the newest two are kept."""
+
+    def __init__(self, folder: Path) -> None:
+        """Open or make the folder."""
+        import orbax.checkpoint as ocp
+
+        self._ocp = ocp
+        options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False)
+        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
+
+    def save(self, step: int, state: Any, history: list[dict[str, float]]) -> None:
+        """Keep the state after `step` steps; a step that is kept already is left alone."""
+        if step == 0 or step in self._manager.all_steps():
+            return
+        args = self._ocp.args
+        self._manager.save(
+            step,
+            args=args.Composite(state=args.StandardSave(state), history=args.JsonSave(history)),
+        )
+
+    def restore(self, like: Any) -> tuple[int, Any, list[dict[str, float]]] | None:
+        """Steps, state and history of the newest checkpoint; None when there is none.
+
+        Args:
+            like: a state of the same structure and shapes.
+        """
+        step = self._manager.latest_step()
+        if step is None:
+            return None
+        args = self._ocp.args
+        held = self._manager.restore(
+            step,
+            args=args.Composite(state=args.StandardRestore(like), history=args.JsonRestore()),
+        )
+        return step, held["state"], list(held["history"])
+
+    def close(self) -> None:
+        """Release the folder."""
+        self._manager.close()

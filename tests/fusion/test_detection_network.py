@@ -1,0 +1,326 @@
+"""Networks, mini-batches and losses of the detector: oracles, parameter counts, a few steps."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fusion.detection import fitting
+from fusion.detection.calibration import Calibration
+from fusion.detection.detect import to_objects
+from fusion.detection.detection_loss import class_loss, regression_loss
+from fusion.detection.detector import count_main_parameters, fuse, init_detector
+from fusion.detection.encodings import box3d_to_box4c, box_corners, project_boxes
+from fusion.detection.examples import Example, flip, make_example, make_inputs, stack_examples
+from fusion.detection.fitting import fit_detector, frame_order, run_detector
+from fusion.detection.io import Frame
+from fusion.detection.objects import Objects
+from fusion.detection.proposals import Detections, anchor_boxes, decode_second, final_boxes
+from fusion.detection.sampling import Assignment, Sample, assign, draw
+from fusion.detection.scoring import car_precision, image_scale, weight_auroc
+from fusion.detection.settings import DetectorConfig, detector_preset
+from fusion.detection.training import (
+    SENSOR_FAILURES,
+    DetectorTraining,
+    learning_rate,
+    training_preset,
+)
+from fusion.detection.views import TransposedConv
+from fusion.targets import check_targets
+
+TINY = detector_preset("tiny")
+PLANE = np.array([0.0, -1.0, 0.0, 1.6])
+
+
+def a_frame(seed: int = 0) -> Frame:
+    """Two boxes of points on flat ground, a picture with a bright patch where each one is."""
+    rng = np.random.default_rng(seed)
+    boxes = np.array([[-2.4, 1.6, 9.4, 4.2, 1.7, 1.5, 0.1], [3.4, 1.6, 14.6, 4.2, 1.7, 1.5, 1.5]])
+    p2 = np.array([[70.0, 0, 48, 0], [0, 70.0, 16, 0], [0, 0, 1, 0]])
+    velo = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
+    calibration = Calibration(np.stack([p2] * 4), np.eye(3), velo, velo)
+    clouds = [np.stack([rng.uniform(-7, 7, 300), np.full(300, 1.6), rng.uniform(4, 20, 300)], 1)]
+    for x, y, z, length, width, height, yaw in boxes:
+        local = rng.uniform(-0.5, 0.5, (150, 3)) * [length, height, width]
+        c, s = np.cos(yaw), np.sin(yaw)
+        px, pz = c * local[:, 0] + s * local[:, 2], -s * local[:, 0] + c * local[:, 2]
+        clouds.append(np.stack([x + px, y - height / 2 + local[:, 1], z + pz], axis=1))
+    camera = np.concatenate(clouds)
+    lidar = np.stack([camera[:, 2], -camera[:, 0], -camera[:, 1]], axis=1)
+    points = np.concatenate([lidar, np.full((len(lidar), 1), 0.5)], axis=1).astype(np.float32)
+    image = np.full((32, 96, 3), 80, np.uint8)
+    image[10:20, 30:50] = 200
+    n = len(boxes)
+    labels = Objects(
+        np.array(["Car"] * n, "<U14"), np.zeros(n), np.zeros(n, np.int64), np.zeros(n),
+        np.array([[20.0, 5, 45, 28], [55, 8, 75, 25]]), boxes[:, [5, 4, 3]], boxes[:, :3],
+        boxes[:, 6], np.full(n, np.nan),
+    )  # fmt: skip
+    return Frame("000000", image, points, calibration, labels, PLANE)
+
+
+@pytest.fixture(scope="module")
+def example() -> Example:
+    made, counts = make_example(a_frame(), TINY)
+    assert counts == {"plane_fitted": False, "points_dropped": 0, "labels_dropped": 0}
+    return made
+
+
+def test_examples_keep_what_is_in_the_picture(example: Example) -> None:
+    frame = a_frame()
+    assert example.image.shape == (16, 48, 3) and example.image.dtype == np.uint8
+    kept = example.points[example.point_mask]
+    # Lidar coordinates: forward is z of the camera, and u = 70 x / z + 48 lies in [0, 96).
+    u = -70 * kept[:, 1] / kept[:, 0] + 48
+    assert (u >= 0).all() and (u < 96).all()
+    expected = -70 * frame.points[:, 1] / frame.points[:, 0] + 48
+    v = -70 * frame.points[:, 2] / frame.points[:, 0] + 16
+    seen = (expected >= 0) & (expected < 96) & (v >= 0) & (v < 32)
+    assert len(kept) == seen.sum() < len(frame.points)
+    np.testing.assert_allclose(example.truth[:2, 6], [0.1, 1.5], atol=1e-6)
+    assert example.truth_mask.tolist() == [True, True, False, False]
+    np.testing.assert_allclose(example.image_size, [32, 96])
+
+    few = dataclasses.replace(TINY, max_points=50, max_objects=1)
+    made, counts = make_example(frame, few)
+    assert counts["points_dropped"] == seen.sum() - 50 and counts["labels_dropped"] == 1
+    np.testing.assert_allclose(made.truth[0, 2], 9.4)  # the nearer one stays
+    behind = frame._replace(points=frame.points * np.array([-1, 1, 1, 1], np.float32))
+    with pytest.raises(ValueError, match="frame 000000: none of 600 lidar points lies in the im"):
+        make_example(behind, TINY)
+    with pytest.raises(ValueError, match=r"frame 000000: .* points near the expected ground"):
+        make_example(frame._replace(plane=None, points=frame.points[:9]), TINY)
+
+
+def test_mirrored_frames_keep_their_projection(example: Example) -> None:
+    truth, p2 = jnp.asarray(example.truth[:2]), jnp.asarray(example.p2)
+    points = jnp.asarray(a_frame().points[:5, :3])
+    plane = jnp.array([0.1, -0.99, 0.05, 1.6])
+    image = jnp.arange(36.0).reshape(3, 4, 3)
+    turned, moved, new_p2, new_plane, boxes = flip(image, points, p2, jnp.float32(96), plane, truth)
+    np.testing.assert_array_equal(turned, image[:, ::-1])
+    before = np.asarray(project_boxes(box_corners(truth), p2, 32.0, 96.0))
+    after = np.asarray(project_boxes(box_corners(boxes), new_p2, 32.0, 96.0))
+    np.testing.assert_allclose(after[:, [0, 2]], before[:, [0, 2]], atol=1e-4)
+    np.testing.assert_allclose(after[:, [1, 3]], 1 - before[:, [3, 1]], atol=1e-4)
+    np.testing.assert_allclose(moved @ new_plane[:3], points @ plane[:3], rtol=1e-5)
+
+
+def test_transposed_convolution_equals_the_dilated_one() -> None:
+    x = jax.random.normal(jax.random.key(0), (2, 3, 5, 4))
+    ours: Any = TransposedConv(6)
+    params = ours.init(jax.random.key(1), x)
+    # Dilated by 2 and padded by (1, 2): output 2i + a reads input (2i + a - 1 + m) / 2, where our
+    # kernel counts its taps the other way round.
+    kernel = params["params"]["kernel"][::-1, ::-1]
+    expected = jax.lax.conv_general_dilated(
+        x, kernel, (1, 1), ((1, 2), (1, 2)), lhs_dilation=(2, 2),
+        dimension_numbers=("NHWC", "HWIO", "NHWC"),
+    )  # fmt: skip
+    got = ours.apply(params, x)
+    assert got.shape == (2, 6, 10, 6)
+    np.testing.assert_allclose(got, expected, atol=1e-5)
+
+
+def test_parameters_match_and_weights_start_even() -> None:
+    for name in ("paper", "small"):
+        avod, argate = (
+            count_main_parameters(detector_preset(name, m)) for m in ("avod", "avod_argate")
+        )
+        assert avod < argate < 1.02 * avod
+    batch_norm = dataclasses.replace(TINY, norm="batch")
+    params, stats = jax.jit(partial(init_detector, config=batch_norm))(jax.random.key(0))
+    assert set(params) == {"main", "auxiliary", "targets"} and jax.tree.leaves(stats)
+    assert float(jnp.abs(params["main"]["gate"]["fusion"]["kernel"]).max()) == 0
+    kernel = params["main"]["second"]["fc0"]["kernel"]
+    np.testing.assert_allclose(kernel.std(), np.sqrt(2 / kernel.shape[0]), rtol=0.1)
+    crops = (jnp.full((1, 2, 3, 3, 1), 2.0), jnp.full((1, 2, 3, 3, 1), 4.0))
+    np.testing.assert_allclose(fuse(crops, jnp.ones((1, 2))), 3.0)
+    np.testing.assert_allclose(fuse(crops, jnp.array([[2.0, 0.0]])), 2.0)
+
+
+def test_mini_batches_are_half_positive_at_most() -> None:
+    boxes = jnp.array(
+        [[0.0, 0, 2, 2], [0.4, 0, 2.4, 2], [1, 0, 3, 2], [9, 9, 11, 11], [0, 0, 2, 2]]
+    )
+    truth = jnp.array([[0.0, 0, 2, 2], [0, 0, 2, 2]])
+    got = assign(
+        boxes, jnp.array([True] * 4 + [False]), truth, jnp.array([True, False]), (0.3, 0.5)
+    )
+    # Overlaps 1, 2/3, 1/3 (neither), 0; the last box is padding.
+    assert got.positive.tolist() == [True, True, False, False, False]
+    assert got.negative.tolist() == [False, False, False, True, False]
+    n = 40
+    positive = jnp.arange(n) < 30
+    many = Assignment(positive, jnp.arange(n) >= 32, jnp.zeros(n, jnp.int32))
+    chosen = set()
+    for seed in range(20):
+        sample = draw(jax.random.key(seed), many, 16)
+        index = np.asarray(sample.indices)
+        assert sample.valid.all() and len(set(index.tolist())) == 16
+        assert (index[np.asarray(sample.positive)] < 30).all() and sample.positive.sum() == 8
+        assert (index[~np.asarray(sample.positive)] >= 32).all()
+        chosen |= set(index.tolist())
+    assert len(chosen) > 30  # drawn, not always the same
+    few = Assignment(jnp.arange(n) < 2, jnp.arange(n) >= 35, many.match)
+    sample = draw(jax.random.key(0), few, 16)
+    assert sample.positive.sum() == 2 and sample.valid.sum() == 7
+
+
+def test_losses_by_hand() -> None:
+    sample = Sample(
+        jnp.arange(4), jnp.array([True, False, False, True]), jnp.array([True, True, False, True])
+    )
+    scores = jnp.log(jnp.array([[0.25, 0.75], [0.5, 0.5], [1e-6, 1.0], [0.9, 0.1]]))
+    expected = -(np.log(0.75) + np.log(0.5) + np.log(0.1)) / 3
+    np.testing.assert_allclose(class_loss(scores, sample), expected, rtol=1e-5)
+    predicted = jnp.array([[0.5, 2.0], [9.0, 9.0], [9.0, 9.0], [0.0, 0.0]])
+    got = regression_loss(predicted, jnp.zeros((4, 2)), sample)
+    np.testing.assert_allclose(got, (0.125 + 1.5) / 2)
+    nothing = Sample(jnp.arange(4), jnp.zeros(4, bool), jnp.ones(4, bool))
+    assert float(regression_loss(predicted, jnp.zeros((4, 2)), nothing)) == 0
+
+
+def test_right_offsets_decode_to_the_label() -> None:
+    plane = jnp.asarray(PLANE, jnp.float32)
+    truth = jnp.array([[1.0, 1.5, 12.0, 4.0, 1.7, 1.5, 0.3], [-3, 1.6, 20, 3.6, 1.6, 1.5, -1.9]])
+    proposals = jnp.array([[1.2, 1.6, 12.3, 4.2, 1.5, 1.6], [-3.1, 1.6, 19.5, 1.6, 1.5, 4.2]])
+    offsets = box3d_to_box4c(truth, plane) - box3d_to_box4c(anchor_boxes(proposals), plane)
+    angle = jnp.stack([jnp.cos(truth[:, 6]), jnp.sin(truth[:, 6])], axis=1)
+    boxes = decode_second(proposals, offsets, angle, plane)
+    np.testing.assert_allclose(boxes, truth, atol=1e-4)
+    config = dataclasses.replace(TINY, score_threshold=0.2, max_detections=3)
+    twice = jnp.concatenate([boxes, boxes + 0.05, boxes.at[:, 0].add(30.0)])
+    scores = jnp.array([[0.0, 2], [0, 3], [0, 1], [0, 0.5], [0, -3], [0, 4]])
+    mask = jnp.array([True, True, True, True, True, False])
+    found = final_boxes(twice, scores, mask, jnp.array([0.4, 0.6]), config)
+    # Doubles go, the fifth is below the threshold, the sixth is no proposal.
+    assert found.mask.tolist() == [True, True, False]
+    np.testing.assert_allclose(found.boxes[:2], truth[::-1], atol=1e-4)
+    np.testing.assert_allclose(found.scores[0], 1 / (1 + np.exp(-3)), rtol=1e-5)
+
+
+def test_detections_become_kitti_objects() -> None:
+    frame = a_frame()
+    truth = np.asarray(make_example(frame, TINY)[0].truth[:3], np.float32)
+    truth[2] = [0, 1.6, -9, 4, 1.6, 1.5, 0]  # behind the camera
+    found = Detections(
+        jnp.asarray(truth), jnp.array([0.9, 0.8, 0.7]), jnp.ones(3, bool), jnp.full(2, 0.5)
+    )
+    objects = to_objects(found, frame.calibration.p2, np.array([32.0, 96.0]))
+    assert len(objects) == 2 and frame.labels is not None
+    np.testing.assert_allclose(objects.dimensions, frame.labels.dimensions, atol=1e-5)
+    np.testing.assert_allclose(objects.location, frame.labels.location, atol=1e-5)
+    assert (objects.bbox[:, :2] >= 0).all() and (objects.bbox[:, 2] <= 95).all()
+    np.testing.assert_allclose(objects.alpha[1], 1.5 - np.arctan2(3.4, 14.6), atol=1e-5)
+    # In pixels of the benchmark the labels are 23 * 12.9 and 17 * 12.9 high: all count.
+    assert image_scale(1242.0) == 1.0 and image_scale(96.0) == 1242 / 96
+    exact = dataclasses.replace(objects, bbox=frame.labels.bbox, alpha=frame.labels.alpha)
+    scored = car_precision([frame.labels], [exact], [96.0])
+    assert scored.n_objects.tolist() == [[2, 2, 2]] and scored.precision[0, 3, 1, 1] == 1.0
+    assert weight_auroc(np.array([[0.5, 0.5]] * 4), np.array([[0.2, 0.8]] * 4), 0) == 1.0
+
+
+FAILING = DetectorTraining(
+    steps=6, batch_size=1, learning_rate=3e-3, schedule="cosine", failure_share=0.9,
+    failure_kinds=("camera_noise", "lidar_loss"), l2=0.0, l2_dense=0.0,
+)  # fmt: skip
+
+
+@pytest.mark.relaxed
+def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) -> None:
+    folder = tmp_path / "checkpoints"
+    rows: list[int] = []
+    whole = fit_detector(
+        3, TINY, FAILING, 3, lambda i: example, report_every=2,
+        on_report=lambda step, row: rows.append(step),
+    )  # fmt: skip
+    assert rows == [2, 4, 6] and int(whole.state.step) == 6
+    assert fitting._step(TINY, FAILING)._cache_size() == 1  # type: ignore[attr-defined]
+    assert all(np.isfinite(list(row.values())).all() for row in whole.history)
+    assert whole.history[0]["rpn_positives"] > 0 and whole.history[0]["positives"] > 0
+    assert 0 < whole.history[-1]["weight_camera"] < 1
+    assert float(check_targets(whole.state.params["targets"], TINY.targets)) == 0.0
+
+    def stop(step: int, row: dict[str, float]) -> None:
+        if step == 4:
+            raise KeyboardInterrupt
+
+    with pytest.raises(KeyboardInterrupt):
+        fit_detector(3, TINY, FAILING, 3, lambda i: example, report_every=2, on_report=stop,
+                     checkpoint_dir=folder)  # fmt: skip
+    with pytest.raises(ValueError, match="holds checkpoints of another run"):
+        fit_detector(3, TINY, FAILING, 3, lambda i: example, checkpoint_dir=folder)
+    again = fit_detector(
+        3, TINY, FAILING, 3, lambda i: example, report_every=2, checkpoint_dir=folder, resume=True
+    )
+    for a, b in zip(jax.tree.leaves(whole.state), jax.tree.leaves(again.state), strict=True):
+        np.testing.assert_array_equal(a, b)
+
+    found = run_detector(whole.state, TINY, [example, example])
+    assert len(found) == 2 and found[0].boxes.shape == (4, 7)
+    np.testing.assert_array_equal(found[0].boxes, found[1].boxes)
+    assert found[0].mask.any() and np.isfinite(found[0].boxes).all()
+    np.testing.assert_allclose(found[0].weights.sum(), 1.0, rtol=1e-5)
+    # A dead lidar leaves the camera's proposals.
+    dead = run_detector(whole.state, TINY, [example], failure="lidar_loss")
+    assert dead[0].mask.any()
+    with pytest.raises(ValueError, match="failure 'lidar_theft', expected one of camera_noise"):
+        run_detector(whole.state, TINY, [example], failure="lidar_theft")
+
+
+def test_every_frame_comes_once_in_an_epoch() -> None:
+    order = np.concatenate([frame_order(1, 5, step, 2) for step in range(5)])
+    assert sorted(order[:5].tolist()) == sorted(order[5:].tolist()) == list(range(5))
+    assert order[:5].tolist() != order[5:].tolist()
+    assert frame_order(1, 5, 3, 2).tolist() == order[6:8].tolist()
+
+
+def test_choices_are_checked_and_rates_fall() -> None:
+    paper = training_preset("paper")
+    np.testing.assert_allclose(learning_rate(paper, jnp.int32(59_999)), 0.8e-4, rtol=1e-5)
+    np.testing.assert_allclose(learning_rate(paper, jnp.int32(60_000)), 0.64e-4, rtol=1e-5)
+    for make, message in (
+        (lambda: DetectorTraining(failure_share=1.5), "failure_share=1.5"),
+        (lambda: DetectorTraining(steps=0), "steps=0"),
+        (lambda: DetectorTraining(failure_kinds=("sun",)), "failure 'sun', expected of camera_no"),
+        (lambda: DetectorTraining(failure_share=0.5, failure_kinds=("camera_fog",)), "of each"),
+        (lambda: detector_preset("huge"), "preset='huge', expected one of paper"),
+        (lambda: detector_preset("small", "yolo"), "model='yolo'"),
+        (lambda: DetectorConfig(widths=(6, 8), layers=(1, 1), norm="group"), "multiples of 4"),
+        (lambda: DetectorConfig(layers=(1,)), "one positive number of layers"),
+        (lambda: DetectorConfig(rpn_iou=(0.6, 0.5)), "rpn_iou=.0.6, 0.5."),
+        (lambda: DetectorConfig(dropout=1.0), "dropout=1.0"),
+        (lambda: training_preset("huge"), "preset='huge'"),
+    ):
+        with pytest.raises(ValueError, match=message):
+            make()
+    assert len(SENSOR_FAILURES) == 9
+
+
+@pytest.mark.slow
+@pytest.mark.relaxed
+def test_avod_learns_two_cars(example: Example) -> None:
+    config = detector_preset("tiny", "avod")
+    train = dataclasses.replace(
+        FAILING, steps=300, failure_share=0.0, flip=False, learning_rate=1e-2
+    )
+    fitted = fit_detector(0, config, train, 1, lambda i: example)
+    assert fitted.history[-1]["total"] < 0.2 * fitted.history[0]["total"]
+    found = run_detector(fitted.state, config, [example])[0]
+    best = found.boxes[:2][np.argsort(found.boxes[:2, 2])]
+    np.testing.assert_allclose(best[:, [0, 2]], example.truth[:2, [0, 2]], atol=0.5)
+
+
+def test_inputs_of_a_batch(example: Example) -> None:
+    batch = stack_examples([example, example])
+    inputs = jax.jit(jax.vmap(partial(make_inputs, config=TINY)))(batch)
+    assert inputs.bev.shape == (2, 32, 32, 6) and inputs.anchors.shape == (2, 128, 6)
+    assert int(inputs.n_occupied[0]) > 10 and inputs.bev[0].max() > 0.5

@@ -1,0 +1,150 @@
+"""The detector's commands on tiny frames: prepare with bad frames, train, eval, study."""
+
+from __future__ import annotations
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from fusion.detection.cache import open_cache, read_example, split_frames
+from fusion.detection.calibration import Calibration
+from fusion.detection.io import (
+    read_results,
+    write_calibration,
+    write_labels,
+    write_plane,
+    write_points,
+)
+from fusion.detection.objects import Objects
+from fusion.detection.settings import CAR_SIZES
+from scripts import study_detector
+from scripts import train_detector as command
+
+
+def write_frame(root: Path, name: str, seed: int) -> None:
+    """A car of points on flat ground in front of a 96 x 32 camera."""
+    rng = np.random.default_rng(seed)
+    x, z = rng.uniform(-3, 3), rng.uniform(8, 14)
+    body = rng.uniform(-0.5, 0.5, (200, 3)) * [4.2, 1.5, 1.7] + [x, 0.85, z]
+    ground = np.stack([rng.uniform(-7, 7, 300), np.full(300, 1.6), rng.uniform(4, 20, 300)], 1)
+    camera = np.concatenate([body, ground])
+    lidar = np.stack([camera[:, 2], -camera[:, 0], -camera[:, 1]], axis=1)
+    points = np.concatenate([lidar, np.full((500, 1), 0.5)], axis=1)
+    p2 = np.array([[70.0, 0, 48, 0], [0, 70.0, 16, 0], [0, 0, 1, 0]])
+    velo = np.array([[0.0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]])
+    folder = root / "training"
+    write_calibration(
+        folder / "calib" / f"{name}.txt", Calibration(np.stack([p2] * 4), np.eye(3), velo, velo)
+    )
+    write_points(folder / "velodyne" / f"{name}.bin", points)
+    write_plane(folder / "planes" / f"{name}.txt", np.array([0.0, -1, 0, 1.6]))
+    image = rng.integers(0, 255, (32, 96, 3)).astype(np.uint8)
+    (folder / "image_2").mkdir(parents=True, exist_ok=True)
+    Image.fromarray(image).save(folder / "image_2" / f"{name}.png")
+    one = np.zeros(1)
+    labels = Objects(
+        np.array(["Car"], "<U14"), one, np.zeros(1, np.int64), one,
+        np.array([[30.0, 8, 60, 24]]), np.array([[1.5, 1.7, 4.2]]), np.array([[x, 1.6, z]]),
+        one, np.full(1, np.nan),
+    )  # fmt: skip
+    write_labels(folder / "label_2" / f"{name}.txt", labels)
+
+
+@pytest.fixture()
+def root(tmp_path: Path) -> Path:
+    folder = tmp_path / "kitti"
+    for i in range(4):
+        write_frame(folder, f"{i:06d}", i)
+    (folder / "ImageSets").mkdir()
+    (folder / "ImageSets" / "train.txt").write_text("000000\n000001\n000002\n000777\n")
+    (folder / "ImageSets" / "val.txt").write_text("000003\n")
+    return folder
+
+
+def test_prepare_counts_what_it_leaves_out(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    calibration = root / "training" / "calib" / "000001.txt"
+    calibration.unlink()
+    options = command.Prepare(root, "tiny", any_size=True)
+    with pytest.raises(FileNotFoundError, match=r"000001\.txt does not exist"):
+        command.main(options)
+    result = command.main(command.Prepare(root, "tiny", any_size=True, skip_bad=True))
+    text = capsys.readouterr().out
+    assert "skipped 000001" in text and "1 listed frames have no image" in text
+    assert text.splitlines()[-1].startswith("result: frames_train=2 frames_val=1 skipped=1")
+    assert result["missing"] == 1 and result["plane_fitted"] == 0
+    cache = open_cache(root / "cache_tiny")
+    assert cache.splits == {"train": ("000000", "000002"), "val": ("000003",)}
+    assert cache.sizes == CAR_SIZES[1:]  # too few cars for clusters
+    assert cache.config("avod").anchors.sizes == CAR_SIZES[1:]
+    assert read_example(cache.folder, "000003").truth_mask.sum() == 1
+    assert len(cache.read("train")) == 2
+
+
+@pytest.mark.parametrize(
+    ("damage", "message"),
+    [
+        ("size", "96x32 pixels, expected 1224x370"),
+        ("points", "0 bytes"),
+        ("nan", "1 of 500 points hold NaN"),
+        ("colour", "an empty image"),
+        ("class", "class 'Bus'"),
+    ],
+)
+def test_bad_frames_are_named(root: Path, damage: str, message: str) -> None:
+    folder = root / "training"
+    if damage == "points":
+        (folder / "velodyne" / "000002.bin").write_bytes(b"")
+    elif damage == "nan":
+        data = np.fromfile(folder / "velodyne" / "000002.bin", "<f4")
+        data[5] = np.nan
+        data.tofile(folder / "velodyne" / "000002.bin")
+    elif damage == "colour":
+        Image.fromarray(np.full((32, 96, 3), 7, np.uint8)).save(folder / "image_2" / "000002.png")
+    elif damage == "class":
+        path = folder / "label_2" / "000002.txt"
+        path.write_text(path.read_text().replace("Car", "Bus"))
+    with pytest.raises(ValueError, match=message):
+        command.main(command.Prepare(root, "tiny", any_size=damage != "size"))
+
+
+def test_missing_steps_are_named(root: Path) -> None:
+    with pytest.raises(FileNotFoundError, match="run `prepare` first"):
+        command.main(command.Train(root, preset="tiny"))
+    (root / "ImageSets" / "val.txt").write_text("000900\n")
+    with pytest.raises(ValueError, match=r"none of the 1 frames of ImageSets/val\.txt"):
+        split_frames(root, ("train", "val"))
+    with pytest.raises(ValueError, match="failure 'camera_theft'"):
+        command.main(command.Eval(root, preset="tiny", failure="camera_theft"))
+    with pytest.raises(ValueError, match="failure 'rain', expected of camera_noise"):
+        study_detector.evaluations(study_detector.Config(root, kinds=("rain",)))
+
+
+@pytest.mark.slow
+@pytest.mark.relaxed
+def test_study_trains_and_evaluates_both_models(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = study_detector.Config(
+        root, seeds=1, preset="tiny", steps=4, kinds=("camera_blackout", "lidar_loss"),
+        any_size=True, out=tmp_path / "runs", results=tmp_path / "results",
+    )  # fmt: skip
+    study_detector.main(options)
+    table = json.loads((tmp_path / "results" / "study_detector.json").read_text())
+    cells = {(row["row"], row["model"], row["metric"]) for row in table["rows"]}
+    for model in ("avod", "avod_argate"):
+        assert ("clean", model, "3d_moderate_r40") in cells
+        assert ("lidar_loss", model, "3d_moderate_r40") in cells
+        assert ("mean of failures", model, "3d_moderate_r40") in cells
+    assert ("camera_blackout", "avod_argate", "weight_auroc") in cells
+    assert ("camera_blackout", "avod", "weight_auroc") not in cells
+    run = tmp_path / "runs" / "study_detector_tiny" / "avod_argate_s0"
+    assert len(read_results(run / "eval_clean" / "data" / "000003.txt").score) > 0
+    assert (run / "eval_clean" / "000003_bird.png").stat().st_size > 1000
+    assert (run / "training.png").exists()
+    before = (run / "result.json").read_text()
+    study_detector.main(options)
+    assert (run / "result.json").read_text() == before
+    assert "result: evaluations=0" in capsys.readouterr().out.splitlines()[-1]

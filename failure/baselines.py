@@ -24,7 +24,7 @@ def uniform(rng: np.random.Generator, task: Task, n: int) -> np.ndarray:
 
 
 def worst_corner(task: Task, slope: np.ndarray) -> np.ndarray:
-    """Where a linear function with this slope is largest: a corner, or a point of the sphere."""
+    """Where a function of slope ``[D]`` is largest: at a corner, or on the sphere along it."""
     if task.kind == "box":
         return task.size * np.where(slope >= 0, 1.0, -1.0)
     return task.size * slope / max(float(np.linalg.norm(slope)), 1e-300)
@@ -36,8 +36,8 @@ def ridge(
     """Ridge regression with an intercept on standardised outputs.
 
     Args:
-        x: inputs scaled to unit variance.
-        y: outputs.
+        x: inputs scaled to unit variance, ``[n, D]``.
+        y: outputs, ``[n]``.
         penalty: ratio of noise to prior variance of a slope.
 
     Returns:
@@ -54,7 +54,7 @@ def ridge(
 
 
 def monte_carlo(rng: np.random.Generator, task: Task, n_left: int) -> np.ndarray:
-    """The next block of uniform points."""
+    """The next block of uniform points, ``[min(50, n_left), D]``."""
     return uniform(rng, task, min(50, n_left))
 
 

@@ -242,7 +242,7 @@ def retained_accuracy(corrupted: float, clean: float) -> float:
 
 
 def mean_retained_accuracy(corrupted: Mapping[str, float], clean: float) -> float:
-    """mRA, the mean of `retained_accuracy` over failure kinds.
+    """mRA, the mean of `retained_accuracy` over F failure kinds: `mRA = sum_f A_f / (F A_clean)`.
 
     Args:
         corrupted: failure kind -> accuracy under it.

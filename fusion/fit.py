@@ -207,7 +207,7 @@ def test_output(
     *,
     kind: FailureKind | None = None,
 ) -> TestOutput:
-    """Run the exported main model on the corrupted test rows.
+    """Run the exported main model on the corrupted test rows `[N, K, T]`.
 
     Args:
         key: the run's key; the test corruption depends on it and on nothing else, so that all

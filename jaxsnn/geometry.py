@@ -176,7 +176,7 @@ def disc_box_contact(
 
 
 def polygon_segments(polygon: Polygon) -> np.ndarray:
-    """The sides ``(ax, ay, bx, by)`` of a closed polygon, one row for each corner."""
+    """The sides ``(ax, ay, bx, by)`` of a closed polygon ``[k, 2]``, as ``[k, 4]``."""
     points = np.asarray(polygon, dtype=np.float64)
     return np.concatenate([points, np.roll(points, -1, axis=0)], axis=1)
 

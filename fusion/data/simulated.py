@@ -180,8 +180,9 @@ def bayes_accuracy(
 def oracle_accuracy(config: SimulatedConfig, protocol: Protocol) -> float:
     """Accuracy of the best classifier that is told which channels failed.
 
-    The mean of `bayes_accuracy` over the failing sets of the protocol and its clean share: no model
-    can do better in the mean when failed channels read noise that is independent of the class.
+    The mean of `bayes_accuracy` over the failing sets of the protocol and its clean share `s`,
+    `s A(all) + (1 - s) mean_F A(all - F)`: no model can do better in the mean when failed channels
+    read noise that is independent of the class.
     """
     k = config.n_channels
     if protocol.n_channels != k:

@@ -85,8 +85,11 @@ def recall_thresholds(scores: np.ndarray, n_objects: int) -> np.ndarray:
     """The scores at which recall comes closest to 0, 1/40, ..., 1 (at most 41 of them).
 
     Args:
-        scores: scores of the matched detections, any order.
+        scores: `[m]` scores of the matched detections, any order.
         n_objects: objects that count.
+
+    Returns:
+        Thresholds, descending.
     """
     ordered = np.sort(scores)[::-1]
     last = len(ordered) - 1
@@ -107,7 +110,8 @@ def average_precision_cap(n_objects: int, points: int) -> float:
     """The largest average precision [%] that a set with so few objects can reach.
 
     With n < 41 objects only about n recall steps exist, and the steps that are missing count as
-    precision 0: perfect detections of 5 cars score 18.2 under R11.
+    precision 0, `AP <= 100 (steps reached) / points`: perfect detections of 5 cars score 18.2
+    under R11.
 
     Example:
         >>> round(average_precision_cap(5, 11), 1)

@@ -159,7 +159,7 @@ def order_closure(pairs: Sequence[tuple[int, int]], n: int) -> np.ndarray:
 
 
 def order_depth(closure: np.ndarray) -> np.ndarray:
-    """Length of the longest chain below each element: rises by at least one along every pair."""
+    """Longest chain below each element: `closure [n, n]` to `[n]`, at least one more per pair."""
     n = len(closure)
     strict = closure & ~np.eye(n, dtype=bool)
     depth = np.zeros(n)

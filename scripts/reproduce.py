@@ -1,47 +1,62 @@
-"""Reproduce tables of the source and write them to results/, one JSON file per table.
+"""Reproduce the source: run what fills its tables, and write one page that shows all of it.
 
+    python scripts/reproduce.py --preset quick
     python scripts/reproduce.py --table 3.1 3.2 3.3 --preset paper --seeds 5
+    python scripts/reproduce.py --report-only
 
-Each training's scores are kept in `--out` as they come: run the same command again after an
-interruption and it goes on where it was. `--shard 0/2` and `--shard 1/2` in two shells (or on two
-machines that share the folder) halve the time. On one CPU core a HAR run takes about 15 s and a
-driver run about 12 s; Table 3.1 with 5 seeds is 210 runs.
+The first runs a small piece of each chapter (four robots of each network on Scenario 1; four fusion
+networks on HAR, or on simulated windows and says so; three searches for failures of the LDO
+regulator) and writes `report/index.html`: all tables and figures beside the source's, filled up
+with the results of record. The second makes tables of record in results/, `--preset paper` without
+`--table` all of them; the third draws the page from what is there, in seconds.
+
+Every run is kept as it comes: the same command again goes on after an interruption. `--shard 0/2`
+and `--shard 1/2` in two shells (or on two machines that share the folder) halve the time of the
+3.x tables. What each costs is in docs/reproduction.md.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import json
+import shutil
+import time
+from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 import tyro
 
-from scripts import _fusion_tables, _run
+from scripts import _chapters, _run
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """Reproduce tables of the source."""
 
-    table: tuple[str, ...] = ("3.1", "3.2", "3.3", "3.4", "3.5", "3.6")
-    """Numbers of the tables."""
-    preset: str = "paper"
-    """paper for the record, quick for a short check."""
-    seeds: int = 5
-    """Independent trainings per cell."""
+    table: tuple[str, ...] = ()
+    """Numbers of the tables; all of the preset when left out."""
+    preset: Literal["paper", "quick"] = "paper"
+    """paper for the record, quick for a small piece of each chapter."""
+    seeds: int | None = None
+    """Independent runs per cell; paper: 64 robots, 5 trainings, 20 searches."""
     models: tuple[str, ...] = ()
-    """Only these models; all of the table when left out."""
+    """Only these models (networks, search methods); all of the table when left out."""
     shard: str = "0/1"
-    """i/n: do every n-th run, starting with the i-th."""
+    """i/n: do every n-th fusion run, starting with the i-th."""
     data_dir: Path | None = None
     """Folder of the data sets; $FUSION_DATA_DIR and the user cache are searched next."""
     out: Path | None = None
-    """Folder of the single runs; runs/reproduce_<preset> when left out."""
-    results: Path = _run.RESULTS
-    """Where the tables go."""
+    """Folder of the single runs; runs/report for quick; each chapter's own for paper."""
+    results: Path | None = None
+    """Where the tables go; results/ for paper, OUT/results for quick."""
     collect_only: bool = False
     """Train nothing; rebuild the tables from the runs that are there."""
+    report_only: bool = False
+    """Run and collect nothing; draw the page from the tables that are there."""
+    report: Path = Path("report")
+    """Folder of the page."""
+    overwrite: bool = False
+    """Forget the quick runs in OUT."""
 
 
 def _parse_shard(text: str) -> tuple[int, int]:
@@ -54,70 +69,71 @@ def _parse_shard(text: str) -> tuple[int, int]:
     return index, count
 
 
-def _source() -> dict[str, Any]:
-    """The source's printed numbers of the tables that are reproduced."""
-    path = _run.REPOSITORY / "results" / "source_tables.json"
-    held: dict[str, Any] = json.loads(path.read_text(encoding="utf-8"))
-    return held
-
-
-def write_tables(config: Config, out: Path) -> dict[str, Any]:
-    """Write the tables (and the paired comparisons) that have runs; returns them by number."""
-    written = {}
+def _tables(config: Config) -> tuple[str, ...]:
+    """The tables to fill."""
+    known = _chapters.RUNNERS
     for table in config.table:
-        rows, studies = _fusion_tables.collect(table, out, config.seeds, _source())
-        if not rows:
-            continue
-        title, _ = _fusion_tables.TABLES[table]
-        name = table.replace(".", "_")
-        path = config.results / f"table_{name}.json"
-        _run.record_table(path, table, title, rows, preset=config.preset)
-        if studies:
-            study = {"table": table, "title": f"{title}: paired comparisons", "rows": studies}
-            _run.write_json(
-                config.results / f"study_paired_{name}.json",
-                study | {"preset": config.preset} | _run.provenance(),
-            )
-        written[table] = rows
-    return written
+        if table in _chapters.NOT_RUNNABLE:
+            raise ValueError(f"table {table} {_chapters.NOT_RUNNABLE[table]}")
+    unknown = [t for t in config.table if t not in known]
+    if unknown:
+        raise ValueError(f"tables {unknown} are not known; known: {', '.join(known)}")
+    return config.table or (_chapters.QUICK_TABLES if config.preset == "quick" else tuple(known))
+
+
+def _fill(config: Config, out: Path | None, results: Path) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Run the chapters; returns rows and wall seconds by table."""
+    quick = config.preset == "quick"
+    plan = _chapters.Plan(
+        preset=config.preset,
+        results=results,
+        piece=quick and not config.table,
+        seeds=config.seeds,
+        models=config.models,
+        shard=_parse_shard(config.shard),
+        data_dir=config.data_dir,
+        out=out,
+        collect_only=config.collect_only,
+    )
+    by_runner: dict[Callable[..., Any], list[str]] = {}
+    for table in _tables(config):
+        if config.overwrite and out is not None and (out / table).is_dir():
+            shutil.rmtree(out / table)
+        by_runner.setdefault(_chapters.RUNNERS[table], []).append(table)
+    written: dict[str, Any] = {}
+    seconds: dict[str, float] = {}
+    for runner, tables in by_runner.items():
+        started = time.monotonic()
+        written |= runner(plan, tables)
+        seconds[", ".join(tables)] = round(time.monotonic() - started, 1)
+    return written, seconds
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Do the runs that are missing, then write the tables."""
-    unknown = [t for t in config.table if t not in _fusion_tables.TABLES]
-    if unknown:
-        known = ", ".join(_fusion_tables.TABLES)
-        raise ValueError(f"tables {unknown} are not known; known: {known}")
-    index, count = _parse_shard(config.shard)
-    out = config.out or Path("runs") / f"reproduce_{config.preset}"
-    todo = [
-        run
-        for table in config.table
-        for run in _fusion_tables.runs(table, config.seeds)
-        if not config.models or run.model in config.models
-    ]
-    # The source's models first, seed by seed over all tables: an early stop then leaves complete
-    # tables of few seeds.
-    reference = _fusion_tables.REFERENCES
-    todo = sorted(todo, key=lambda run: (run.model in reference, run.seed))[index::count]
-    todo = [] if config.collect_only else [run for run in todo if not run.path(out).exists()]
-    if todo:
-        _run.enable_compilation_cache()
-        from fusion.data import load
+    """Do the runs that are missing, write the tables and the page; returns rows by table."""
+    from scripts import _report
 
-        names = {run.row.settings["dataset"] for run in todo}
-        datasets = {name: load(name, config.data_dir) for name in sorted(names)}
-        with _run.progress() as bar:
-            task = bar.add_task("runs", total=len(todo), status="")
-            for run in todo:
-                bar.update(task, status=f"{run.table} {run.row.name} {run.model} s{run.seed}")
-                if not run.path(out).exists():
-                    dataset = datasets[run.row.settings["dataset"]]
-                    record = _fusion_tables.execute(run, dataset, config.preset)
-                    _run.write_json(run.path(out), record)
-                bar.advance(task)
-    written = write_tables(config, out)
-    _run.print_result(tables=",".join(written) or "none", runs=len(todo), results=config.results)
+    quick = config.preset == "quick"
+    if config.overwrite and not quick:
+        raise ValueError("overwrite is for quick runs; remove the folder of a paper run yourself")
+    _parse_shard(config.shard)
+    _tables(config)
+    out = config.out or (Path("runs") / "report" if quick else None)
+    results = config.results or (_run.RESULTS if not quick or out is None else out / "results")
+    written: dict[str, Any] = {}
+    seconds: dict[str, Any] = {}
+    if not config.report_only:
+        written, seconds = _fill(config, out, results)
+        if quick and out is not None and not config.collect_only:
+            _run.write_json(out / "report.json", {"seconds": seconds} | _run.provenance())
+    fresh = results if results != _run.RESULTS else Path("runs") / "report" / "results"
+    page = _report.write(config.report, fresh=fresh, record=_run.RESULTS)
+    _run.print_result(
+        tables=",".join(written) or "none",
+        seconds=sum(seconds.values()),
+        results=results,
+        page=page,
+    )
     return written
 
 

@@ -202,7 +202,8 @@ def accuracy_rows(seconds: float = 2.0) -> list[dict[str, Any]]:
             config, params = network_setting(
                 "S4", "tuned",
                 config={"control_steps": hold, "hold_steps": hold},
-                params={"gamma": gamma, "homeostasis": 0.0}, stdp={"anti_causal": 1.0},
+                params={"gamma": gamma, "homeostasis": 0.0, "centring": 0.0},
+                stdp={"anti_causal": 1.0},
             )  # fmt: skip
 
             def run(params: Any, config: Any = config, hold: int = hold) -> Any:

@@ -67,6 +67,8 @@ class Config:
     beta: float | None = None
     normalizer: Literal["softmax", "softmax_sigmoid"] | None = None
     path_drop: float | None = None
+    truth_proposals: int | None = None
+    learning_rate: float | None = None
     out: Path = Path("runs/study_detector")
     """Folder of the runs."""
     results: Path = _run.RESULTS
@@ -121,7 +123,8 @@ def execute(config: Config) -> int:
                     config.data, model, config.preset, config.cache, seed=seed, steps=config.steps,  # type: ignore[arg-type]
                     failures=config.failures and not config.real, tau=config.tau,
                     alpha=config.alpha, beta=config.beta, normalizer=config.normalizer,
-                    path_drop=config.path_drop, out=run,
+                    path_drop=config.path_drop, truth_proposals=config.truth_proposals,
+                    learning_rate=config.learning_rate, out=run,
                     resume=(run / "config.json").exists(),
                 )
             )  # fmt: skip

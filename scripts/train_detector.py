@@ -74,6 +74,8 @@ class Train:
     """Temperature of the fixed targets."""
     path_drop: float | None = None
     """Probability to drop a view in training."""
+    truth_proposals: int | None = None
+    """Shifted copies of each label among the training proposals."""
     checkpoint_every: int = 500
     out: Path | None = None
     """Run folder; runs/detector/DATA_CONFIG_PRESET[_failures]_sSEED when left out."""
@@ -160,7 +162,7 @@ def build(config: Train, cache: Any) -> tuple[Any, Any]:
             "`prepare` with the preset of the training"
         )
     detector = cache.config(config.config)
-    given = {k: getattr(config, k) for k in ("norm", "normalizer", "path_drop")}
+    given = {k: getattr(config, k) for k in ("norm", "normalizer", "path_drop", "truth_proposals")}
     detector = dataclasses.replace(detector, **{k: v for k, v in given.items() if v is not None})
     weights = {k: v for k in ("alpha", "beta", "tau") if (v := getattr(config, k)) is not None}
     detector = dataclasses.replace(detector, gate_params=detector.gate_params._replace(**weights))

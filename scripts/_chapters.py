@@ -16,6 +16,8 @@ from typing import Any
 from scripts import _fusion_tables, _run
 
 Written = dict[str, list[dict[str, Any]]]
+# Rows by table, and how many trainings or studies were done for them.
+Done = tuple[Written, int]
 
 SCENARIOS = {"2.3": 1, "2.4": 2, "2.5": 3}
 NETWORKS = ("S1", "S2", "S3", "S4", "Q-learning")
@@ -104,11 +106,12 @@ def _learn(plan: Plan, table: str, network: str) -> dict[str, Any] | None:
     return metrics
 
 
-def spiking(plan: Plan, tables: Sequence[str]) -> Written:
+def spiking(plan: Plan, tables: Sequence[str]) -> Done:
     """Tables 2.3 to 2.5: the four networks and Q-learning on a scenario."""
     from scripts.train_snn import UNITS
 
     written: Written = {}
+    runs = 0
     for table in tables:
         source = source_tables()[table]["rows"]
         row = f"Scenario {SCENARIOS[table]}"
@@ -127,10 +130,11 @@ def spiking(plan: Plan, tables: Sequence[str]) -> Written:
                 rows.append(cell)
             plan.record(table, f"{row}: success rates and steering movements", rows)
             written.setdefault(table, []).extend(rows)
-    return written
+            runs += 1
+    return written, runs
 
 
-def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Written:
+def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Done:
     """Tables 3.1 to 3.6; a quick piece of 3.1 on simulated windows when HAR is not at hand."""
     from fusion.data import load
 
@@ -184,10 +188,10 @@ def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Written:
                 study | {"preset": plan.preset} | _run.provenance(),
             )
         written[table] = rows
-    return written
+    return written, len(todo)
 
 
-def _simulated(plan: Plan, out: Path, seeds: int) -> Written:
+def _simulated(plan: Plan, out: Path, seeds: int) -> Done:
     """The quick piece on simulated windows; its rows are named so and have no printed number."""
     from fusion.data import load
 
@@ -195,27 +199,30 @@ def _simulated(plan: Plan, out: Path, seeds: int) -> Written:
     row = _fusion_tables.Row("simulated windows (HAR not at hand), n_clean=1 uniform", settings)
     dataset = load("simulated")
     rows = []
+    runs = 0
     for model in filter(plan.wants, QUICK_MODELS):
         records = []
         for seed in range(seeds):
             run = _fusion_tables.Run("3.1", row, model, seed)
             if not run.path(out).exists():
                 _run.write_json(run.path(out), _fusion_tables.execute(run, dataset, plan.preset))
+                runs += 1
             records.append(json.loads(run.path(out).read_text(encoding="utf-8")))
         for metric in ("accuracy", "accuracy_clean", "accuracy_corrupted"):
             cell = {"row": row.name, "model": model, "metric": metric, "unit": "%"}
             rows.append(cell | _run.summarize([record[metric] for record in records]))
     plan.record("3.1", _fusion_tables.TABLES["3.1"][0], rows)
-    return {"3.1": rows}
+    return {"3.1": rows}, runs
 
 
-def failures(plan: Plan, tables: Sequence[str]) -> Written:
+def failures(plan: Plan, tables: Sequence[str]) -> Done:
     """Tables 4.1 and 4.2: searches for failures of a circuit."""
     from failure.history import METHODS
     from scripts import study_failures
 
     quick = plan.preset == "quick"
     written: Written = {}
+    runs = 0
     for table in tables:
         circuit, title = CIRCUITS[table]
         out = plan.out / table if plan.out else Path("runs") / f"table_{table.replace('.', '_')}"
@@ -234,13 +241,14 @@ def failures(plan: Plan, tables: Sequence[str]) -> Written:
                     n_total=QUICK_SIMULATIONS,
                 )  # fmt: skip
             rows = study_failures.main(config)["rows"]
+            runs += 1
         if rows:
             plan.record(table, title, rows)
             written[table] = rows
-    return written
+    return written, runs
 
 
-RUNNERS: dict[str, Callable[[Plan, Sequence[str]], Written]] = {
+RUNNERS: dict[str, Callable[[Plan, Sequence[str]], Done]] = {
     **dict.fromkeys(SCENARIOS, spiking),
     **dict.fromkeys(_fusion_tables.TABLES, sensor_fusion),
     **dict.fromkeys(CIRCUITS, failures),

@@ -53,8 +53,8 @@ class Config:
     """Train nothing; rebuild the tables from the runs that are there."""
     report_only: bool = False
     """Run and collect nothing; draw the page from the tables that are there."""
-    report: Path = Path("report")
-    """Folder of the page."""
+    report: Path | None = None
+    """Folder of the page; report/, or OUT/report with --out."""
     overwrite: bool = False
     """Forget the quick runs in OUT."""
 
@@ -81,8 +81,8 @@ def _tables(config: Config) -> tuple[str, ...]:
     return config.table or (_chapters.QUICK_TABLES if config.preset == "quick" else tuple(known))
 
 
-def _fill(config: Config, out: Path | None, results: Path) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Run the chapters; returns rows and wall seconds by table."""
+def _fill(config: Config, out: Path | None, results: Path) -> tuple[dict[str, Any], Any, int]:
+    """Run the chapters; returns rows and wall seconds by table, and the number of runs."""
     quick = config.preset == "quick"
     plan = _chapters.Plan(
         preset=config.preset,
@@ -102,11 +102,14 @@ def _fill(config: Config, out: Path | None, results: Path) -> tuple[dict[str, An
         by_runner.setdefault(_chapters.RUNNERS[table], []).append(table)
     written: dict[str, Any] = {}
     seconds: dict[str, float] = {}
+    runs = 0
     for runner, tables in by_runner.items():
         started = time.monotonic()
-        written |= runner(plan, tables)
+        found, count = runner(plan, tables)
+        written |= found
+        runs += count
         seconds[", ".join(tables)] = round(time.monotonic() - started, 1)
-    return written, seconds
+    return written, seconds, runs
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -121,16 +124,17 @@ def main(config: Config) -> dict[str, Any]:
     out = config.out or (Path("runs") / "report" if quick else None)
     results = config.results or (_run.RESULTS if not quick or out is None else out / "results")
     written: dict[str, Any] = {}
-    seconds: dict[str, Any] = {}
+    runs = 0
     if not config.report_only:
-        written, seconds = _fill(config, out, results)
+        written, seconds, runs = _fill(config, out, results)
         if quick and out is not None and not config.collect_only:
             _run.write_json(out / "report.json", {"seconds": seconds} | _run.provenance())
     fresh = results if results != _run.RESULTS else Path("runs") / "report" / "results"
-    page = _report.write(config.report, fresh=fresh, record=_run.RESULTS)
+    report = config.report or (config.out / "report" if config.out else Path("report"))
+    page = _report.write(report, fresh=fresh, record=_run.RESULTS)
     _run.print_result(
         tables=",".join(written) or "none",
-        seconds=sum(seconds.values()),
+        runs=runs,
         results=results,
         page=page,
     )

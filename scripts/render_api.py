@@ -35,7 +35,7 @@ is up to date, and that each function below is typed and says what it computes.
 **What is stable.** A name on this page keeps its meaning and its arguments within a minor version
 (0.1.x); what changes between minor versions stands in `CHANGELOG.md`. Everything else (names with a
 leading underscore, modules with one, `scripts`, `tests`) may change at any time.
-`fusion.detection` is younger than the rest: its names may still move, and the changelog will say so.
+`fusion.detection` is younger than the rest: its names may still move; the changelog will say so.
 
 **What holds for all of them.** No function keeps state between calls or changes a setting of jax.
 Functions of arrays are pure: they can be jitted, vmapped, differentiated where that is defined, and

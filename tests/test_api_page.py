@@ -18,7 +18,7 @@ NO_FORMULA = {
     "fusion.detection.fitting.frame_order": "indices of frames",
     "fusion.detection.io_geometry.write_plane": "writes a file",
     "fusion.detection.io_text.parse_number": "reads one number of a file",
-    "fusion.detection.objective.detector_loss": "the sum of terms that have docstrings of their own",
+    "fusion.detection.objective.detector_loss": "a sum of terms with docstrings of their own",
     "fusion.detection.scoring.image_scale": "one factor, named by the summary",
     "fusion.detection.training.learning_rate": "one number, named by the summary",
     "fusion.lattice.inputs.require_width": "refuses, computes nothing",

@@ -125,8 +125,14 @@ def in_order(rows: Sequence[Row], source: Table | None) -> list[Row]:
 def provenance(table: Table) -> str:
     """How a file of record was made."""
     versions = ", ".join(f"{k} {v}" for k, v in table.get("versions", {}).items())
+    commands = list(
+        dict.fromkeys(
+            row.get("command") or table.get("command") or "" for row in table.get("rows") or [{}]
+        )
+    )
+    listed = ", ".join(f"`{command}`" for command in commands if command)
     parts = [
-        f"Command: `{table['command']}`" if table.get("command") else "",
+        f"Command{'s' if len(commands) > 1 else ''}: {listed}" if listed else "",
         f"preset {table['preset']}" if table.get("preset") else "",
         f"commit {table['git']}" if table.get("git") else "",
         str(table.get("device", "")),

@@ -182,8 +182,12 @@ def summarize(values: Sequence[float]) -> dict[str, Any]:
 def record_table(
     path: Path, table: str, title: str, rows: Iterable[dict[str, Any]], *, preset: str
 ) -> None:
-    """Write or update a table of record; rows are replaced by (row, model, metric), others stay."""
-    rows = list(rows)
+    """Write or update a table of record; rows are replaced by (row, model, metric), others stay.
+
+    Every row keeps the command and the commit that made it.
+    """
+    made = provenance()
+    rows = [{"command": made["command"], "git": made["git"], **row} for row in rows]
     held: list[dict[str, Any]] = []
     if path.exists():
         held = json.loads(path.read_text(encoding="utf-8"))["rows"]
@@ -195,7 +199,7 @@ def record_table(
     kept = [row for row in held if key(row) not in new]
     write_json(
         path,
-        {"table": table, "title": title, "preset": preset, **provenance(), "rows": kept + rows},
+        {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows},
     )
 
 

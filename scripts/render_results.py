@@ -226,6 +226,12 @@ def headlines(config: Config, source: dict[str, Any]) -> str:
     )
 
 
+def _same(held: list[dict[str, Any]], collected: list[dict[str, Any]]) -> bool:
+    """Do rows of record hold these numbers, whenever and by whatever command they were made?"""
+    bare = [{k: v for k, v in row.items() if k not in ("command", "git")} for row in held]
+    return bool(bare == _run.to_jsonable(collected))
+
+
 def main(config: Config) -> dict[str, Any]:
     """Collect, draw, write; returns what was written."""
     source = _load(_run.REPOSITORY / "results" / "source_tables.json")
@@ -248,7 +254,7 @@ def main(config: Config) -> dict[str, Any]:
     ):
         path = config.results / f"{name}.json"
         # A file that would say the same keeps its commit and date.
-        if collected and not (path.exists() and _load(path)["rows"] == _run.to_jsonable(collected)):
+        if collected and not (path.exists() and _same(_load(path)["rows"], collected)):
             _run.record_table(path, name, title, collected, preset="paper")
     picture = config.docs / "images" / "study_channel_weights.png"
     drawn = draw_channel_weights(config, picture)

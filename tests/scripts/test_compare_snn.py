@@ -11,7 +11,7 @@ from scripts.compare_snn import compare
 def test_differences_are_paired_by_seed_and_missing_networks_are_left_out():
     rng = np.random.default_rng(0)
     base = rng.uniform(60, 90, 12)
-    values = {"S3": base.tolist(), "S4": (base + rng.uniform(1, 6, 12)).tolist() + [0.0]}
+    values = {"S3": base.tolist(), "S4": [*(base + rng.uniform(1, 6, 12)).tolist(), 0.0]}
     rows = [
         {"row": "Scenario 1", "model": m, "metric": "sr_testing", "values": v}
         for m, v in values.items()

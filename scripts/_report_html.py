@@ -98,8 +98,9 @@ def _interval(ours: Measured, unit: str) -> str:
     if ours.interval is None:
         return escape(ours.note or "–")
     low, high = (number(v, unit) for v in ours.interval)
+    span = f"{low} to {high}" if math.isfinite(ours.interval[0]) else low
     note = f"; {ours.note}" if ours.note else ""
-    return escape(f"{low} to {high}{note}")
+    return escape(f"{span}{note}")
 
 
 def scroll_table(label: str, header: Sequence[str], rows: Iterable[str]) -> str:
@@ -116,8 +117,10 @@ def scroll_table(label: str, header: Sequence[str], rows: Iterable[str]) -> str:
 def _line(
     name: str, source: str, ours: Measured | None, judged: str, unit: str, again: bool
 ) -> str:
+    # The origin stands again in the last column, which is out of sight on a phone.
+    quick = tag("small", " (quick)") if ours and ours.origin == "quick run" else ""
     parts = [
-        tag("th", escape(name), scope="row"),
+        tag("th", escape(name), quick, scope="row"),
         tag("td", escape(source), klass="number"),
         tag("td", escape(number(ours.centre, unit)) if ours else "", klass="number"),
         tag("td", mark(judged)),

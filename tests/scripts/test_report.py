@@ -95,8 +95,9 @@ def folders(tmp_path: Path) -> dict[str, Path]:
     hits = _row("undershoot (box)", "HDBO", "first_failure_hit", [1.0, 2.0]) | {
         "n": 7, "values": HITS,
     }  # fmt: skip
+    none = hits | {"model": "Rev-ARGate zeros", "n": 6, "values": [None] * 6, "mean": None}
     worst = _row("undershoot (box)", "HDBO", "worst_case", [0.8, 0.9], unit="V")
-    _write(record, "4.1", [hits, worst])
+    _write(record, "4.1", [hits, none, worst])
     images = tmp_path / "docs" / "images"
     images.mkdir(parents=True)
     (images / "snn_stdp.png").write_bytes(PNG)
@@ -126,7 +127,8 @@ def _line(page: Page, section: str, heading: str, *start: str) -> list[list[str]
 def test_marks_origins_and_directions(folders: dict[str, Path]) -> None:
     _, page = _page(folders)
     testing = "Scenario 1: success rate in testing [%], higher is better"
-    quick, record = _line(page, "table-2.3", testing, "S4")
+    (quick,) = _line(page, "table-2.3", testing, "S4 (quick)")
+    (record,) = _line(page, "table-2.3", testing, "S4")
     assert quick[1:4] == ["100", "100.00", "≈ within"] and quick[-2:] == ["1", "quick run"]
     assert quick[4] == "no interval"
     assert record[1:4] == ["100", "91.00", "✗ worse"] and record[-2:] == ["3", "record"]
@@ -148,6 +150,8 @@ def test_first_failure_is_a_median_and_worst_case_is_not_judged(folders: dict[st
     (hit,) = _line(page, "table-4.1", "undershoot (box): simulations until", "HDBO")
     # The source's 221 lies between the smallest and the largest of seven, which is "none".
     assert hit[1:5] == ["221", "180", "≈ within", "150 to none found; found in 5 of 7"]
+    (zeros,) = _line(page, "table-4.1", "undershoot (box): simulations until", "Rev-ARGate zeros")
+    assert zeros[1:5] == ["262", "none found", "✗ worse", "none found; found in 0 of 6"]
     (worst,) = _line(page, "table-4.1", "undershoot (box): worst case", "HDBO")
     assert worst[1:4] == ["0.36 V", "0.85", "– not judged"]
     (dash,) = _line(page, "table-4.1", "undershoot (box): simulations until", "pBO")
@@ -274,5 +278,5 @@ def test_collecting_from_single_runs(tmp_path: Path) -> None:
     held = json.loads((tmp_path / "out" / "results" / "table_3_1.json").read_text())
     assert held["preset"] == "quick"
     page = Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
-    (line, *_) = _line(page, "table-3.1", "clean: accuracy [%]", "Baseline")
+    (line, *_) = _line(page, "table-3.1", "clean: accuracy [%]", "Baseline (quick)")
     assert line[1:4] == ["94.06", "99.00", "✓ better"] and line[-1] == "quick run"

@@ -7,6 +7,7 @@ be killed at any point and goes on from its log.
 
 from __future__ import annotations
 
+from bisect import bisect_left
 from collections.abc import Callable
 from functools import lru_cache, partial
 from typing import Any
@@ -55,6 +56,13 @@ __all__ = [
 ]
 
 
+# When the data outgrow one of these, a cold fit checks the warm one for a better optimum.
+COLD_CHECKS = (96, 192, 320)
+
+# Relative gain that ends a refit: far below one nat of log evidence in 300 data points.
+FIT_FTOL = 1e-6
+
+
 def _keys(config: SearchConfig, n: int) -> Any:
     """One key per seed for the iteration that follows ``n`` evaluations."""
     keys = [jax.random.fold_in(jax.random.key(seed), n) for seed in config.seeds]
@@ -71,7 +79,7 @@ def _programs(
         return jax.jit(lambda *args: jax.lax.map(lambda a: f(*a), args))
 
     def fit(x: Any, y: Any, n: Any, params: Any, h: Any, fresh: Any) -> Any:
-        return gp_fit.fit(gp_config, x, y, n, params, h, fresh)
+        return gp_fit.fit(gp_config, x, y, n, params, h, fresh, ftol=FIT_FTOL)
 
     def raw(domain: Domain, centres: Any, key: Any) -> Any:
         return acquisition.raw_points(domain, centres, key, acq.n_raw)
@@ -175,7 +183,7 @@ def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
     count = jnp.full((seeds,), state.n, jnp.int32)
     old = state.surrogate
     result = None
-    if old is None or gp.padded_size(old.n_fit) != gp.padded_size(state.n):
+    if old is None or bisect_left(COLD_CHECKS, old.n_fit) != bisect_left(COLD_CHECKS, state.n):
         start = _stack(gp_fit.initial_params(config.gp, dim), seeds)
         eye = _stack(jnp.eye(dim + 1), seeds)
         result = fit(x, y, count, start, eye, jnp.ones((seeds,), bool))
@@ -185,7 +193,6 @@ def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
         if result is None:
             result = warm
         else:
-            # At every new padded size a cold fit checks the warm one for a better optimum.
             better = warm.value >= result.value
 
             def pick(a: Any, b: Any) -> Any:

@@ -32,7 +32,7 @@ __all__ = [
 KERNELS = ("matern52", "rbf", "linear")
 
 # A search pads its data to the next of these sizes.
-SIZES = (96, 192, 320)
+SIZES = (64, 96, 128, 160, 192, 224, 256, 288, 320)
 
 
 @dataclass(frozen=True)
@@ -86,7 +86,7 @@ def padded_size(n: int) -> int:
 
     Example:
         >>> padded_size(50), padded_size(65), padded_size(330)
-        (96, 96, 384)
+        (64, 96, 384)
     """
     for size in SIZES:
         if n <= size:
@@ -171,12 +171,35 @@ def _covariance(k: Array, noise: Array, mask: Array) -> Array:
     return k * (mask[:, None] * mask[None, :]) + jnp.diag(noise * mask + (1.0 - mask))
 
 
+def _invert_lower(factor: Array) -> Array:
+    """Inverse of a lower triangle, by halves: what is known to be zero is not multiplied."""
+    n = factor.shape[0]
+    if n <= 64 or n % 2:
+        eye = jnp.eye(n, dtype=factor.dtype)
+        return jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
+    half = n // 2
+    first, last = _invert_lower(factor[:half, :half]), _invert_lower(factor[half:, half:])
+    low = -(last @ (factor[half:, :half] @ first))
+    return jnp.block([[first, jnp.zeros_like(low.T)], [low, last]])
+
+
+def _gram_of_lower(linv: Array) -> Array:
+    """``linv.T @ linv`` of a lower triangle, by halves."""
+    n = linv.shape[0]
+    if n <= 64 or n % 2:
+        return linv.T @ linv
+    half = n // 2
+    first, low, last = linv[:half, :half], linv[half:, :half], linv[half:, half:]
+    cross = low.T @ last
+    return jnp.block(
+        [[_gram_of_lower(first) + low.T @ low, cross], [cross.T, _gram_of_lower(last)]]
+    )
+
+
 def _inverse_factor(covariance: Array) -> tuple[Array, Array]:
     """Inverse Cholesky factor and log determinant."""
     factor = jnp.linalg.cholesky(covariance)
-    eye = jnp.eye(covariance.shape[0], dtype=covariance.dtype)
-    linv = jax.scipy.linalg.solve_triangular(factor, eye, lower=True)
-    return linv, 2.0 * jnp.sum(jnp.log(jnp.diagonal(factor)))
+    return _invert_lower(factor), 2.0 * jnp.sum(jnp.log(jnp.diagonal(factor)))
 
 
 def condition(

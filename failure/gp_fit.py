@@ -13,6 +13,7 @@ from failure.gp import (
     GPConfig,
     GPParams,
     _covariance,
+    _gram_of_lower,
     _inverse_factor,
     _mask,
     _noise,
@@ -152,7 +153,7 @@ def map_value_and_grad(
     white = white_y - mean * white_one
     alpha = white @ linv
     log_p = -0.5 * (white @ white + log_det + count * _LOG_2PI)
-    inner = alpha[:, None] * alpha[None, :] - linv.T @ linv
+    inner = alpha[:, None] * alpha[None, :] - _gram_of_lower(linv)
     weight = inner * slope * (mask[:, None] * mask[None, :])
     weighted = jnp.sum(s * (weight @ s), 0)
     if config.kernel == "linear":

@@ -71,12 +71,16 @@ def sample(domain: Domain, key: Key[Array, ""], n: int) -> Float[Array, "n d"]:
     key_box, key_ball, key_radius = jax.random.split(key, 3)
     dtype = domain.lower.dtype
     width = domain.upper - domain.lower
-    in_box = domain.lower[None] + width[None] * jax.random.uniform(key_box, (n, dim), dtype)
-    normal = jax.random.normal(key_ball, (n, dim), dtype)
-    share = jax.random.uniform(key_radius, (n, 1), dtype) ** (1.0 / dim)
-    radius = jnp.where(jnp.isfinite(domain.radius), domain.radius, jnp.ones_like(domain.radius))
-    in_ball = radius * share * normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
-    points = jnp.where(jnp.isfinite(domain.radius), in_ball, in_box)
+
+    def in_box() -> Array:
+        return domain.lower[None] + width[None] * jax.random.uniform(key_box, (n, dim), dtype)
+
+    def in_ball() -> Array:
+        normal = jax.random.normal(key_ball, (n, dim), dtype)
+        share = jax.random.uniform(key_radius, (n, 1), dtype) ** (1.0 / dim)
+        return domain.radius * share * normal / jnp.linalg.norm(normal, axis=-1, keepdims=True)
+
+    points = jax.lax.cond(jnp.isfinite(domain.radius), in_ball, in_box)
     return jax.vmap(project, (None, 0))(domain, points)
 
 

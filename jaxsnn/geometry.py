@@ -59,6 +59,14 @@ def ray_segments(
     return jnp.where(hit, t, jnp.inf)
 
 
+def _safe_sqrt(x: Float[Array, "..."]) -> Float[Array, "..."]:
+    """The root of what is positive, else 0, with slope 0 there: a miss must not give NaN slopes."""
+    positive = x > 0
+    return jnp.where(
+        positive, jnp.sqrt(jnp.where(positive, x, jnp.ones_like(x))), jnp.zeros_like(x)
+    )
+
+
 def ray_circles(
     origin: Float[Array, "2"], direction: Float[Array, "2"], circles: Float[Array, "c 3"]
 ) -> Float[Array, "c"]:
@@ -74,7 +82,7 @@ def ray_circles(
     # The perpendicular distance keeps more digits than b^2 - c does in single precision.
     side = _cross(offset, jnp.broadcast_to(direction[None, :], offset.shape))
     gap = circles[:, 2] ** 2 - side**2
-    root = jnp.sqrt(jnp.maximum(gap, 0.0))
+    root = _safe_sqrt(gap)
     inside = jnp.sum(offset**2, axis=1) <= circles[:, 2] ** 2
     t = jnp.where((gap >= 0) & (b < 0), -b - root, jnp.inf)
     return jnp.where(inside, jnp.zeros_like(t), t)
@@ -113,7 +121,7 @@ def disc_circle_contact(
     b = jnp.sum(offset * move, axis=1)
     c = jnp.sum(offset**2, axis=1) - reach**2
     discriminant = b**2 - a * c
-    root = jnp.sqrt(jnp.maximum(discriminant, 0.0))
+    root = _safe_sqrt(discriminant)
     # c / (root - b) is the near root without the cancellation of (-b - root) / a.
     depth = jnp.where(b < 0, root - b, jnp.ones_like(b))
     t = jnp.maximum(c, 0.0) / depth
@@ -143,7 +151,7 @@ def disc_segment_contact(
     """
     start = segments[:, :2]
     edge = segments[:, 2:] - start
-    length = jnp.sqrt(jnp.sum(edge**2, axis=1))
+    length = _safe_sqrt(jnp.sum(edge**2, axis=1))
     unit = edge / jnp.where(length > 0, length, jnp.ones_like(length))[:, None]
     offset = centre[None, :] - start
     distance = _cross(unit, offset)

@@ -1,0 +1,227 @@
+"""The documentation holds: its examples run, its links lead somewhere, its commands parse.
+
+A Python block of a tutorial is executed, after those before it on the page. An HTML comment
+`<!-- not run here: why -->` on the line before a block takes it out, where it would take minutes.
+"""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import inspect
+import re
+import shlex
+import subprocess
+import sys
+import typing
+import unicodedata
+from pathlib import Path
+from typing import Any
+
+import pytest
+import tyro
+
+from scripts import render_api
+
+ROOT = Path(__file__).resolve().parent.parent
+PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
+TUTORIALS = [p for p in PAGES if p.parent.name == "tutorials" and p.name != "index.md"]
+BLOCK = re.compile(r"(<!-- not run here: [^\n]+ -->\n)?```python\n(.*?)```", re.DOTALL)
+FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
+
+
+def blocks(page: Path) -> list[tuple[bool, str, int]]:
+    """The Python blocks of a page: whether it is run, the code, and the line it starts on."""
+    text = page.read_text(encoding="utf-8")
+    return [
+        (m.group(1) is None, m.group(2), text[: m.start(2)].count("\n"))
+        for m in BLOCK.finditer(text)
+    ]
+
+
+def page_name(page: Path) -> str:
+    return str(page.relative_to(ROOT))
+
+
+def with_marks(page: Path) -> Any:
+    """brax warns about its optional engines, and about jax's deprecations, as it is imported."""
+    quiet = [pytest.mark.filterwarnings("ignore")] if "brax" in page.stem else []
+    return pytest.param(page, id=page.stem, marks=quiet)
+
+
+@pytest.mark.relaxed
+@pytest.mark.parametrize("page", [with_marks(page) for page in TUTORIALS])
+def test_tutorial_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    found = blocks(page)
+    assert any(run for run, _, _ in found)
+    names: dict[str, Any] = {"__name__": f"tutorial_{page.stem}"}
+    for run, code, line in found:
+        if run:
+            # Blank lines in front, so that a traceback names the line of the page.
+            exec(compile("\n" * line + code, str(page), "exec"), names)
+
+
+def _missing(node: ast.ImportFrom | ast.Import) -> list[str]:
+    """Names that an import of ours asks for and that are not there."""
+    wanted = (
+        [(a.name, None) for a in node.names]
+        if isinstance(node, ast.Import)
+        else [(node.module or "", a.name) for a in node.names]
+    )
+    missing = []
+    for module, name in wanted:
+        if module.split(".")[0] not in render_api.PACKAGES:
+            continue
+        base = ROOT.joinpath(*module.split("."))
+        path = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
+        read = render_api.read_module(path) if path.exists() else None
+        if read is None:
+            missing.append(module)
+        elif name is not None and name not in read.names:
+            submodule = base.is_dir() and ((base / f"{name}.py").exists() or (base / name).is_dir())
+            if not submodule:
+                missing.append(f"{module}.{name}")
+    return missing
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_examples_import_public_names(page: Path) -> None:
+    for _, code, line in blocks(page):
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.ImportFrom | ast.Import):
+                assert _missing(node) == [], f"{page.name}, line {line + node.lineno}"
+
+
+def slug(heading: str) -> str:
+    """The anchor that mkdocs gives a heading."""
+    plain = re.sub(r"[`*]|\[([^\]]*)\]\([^)]*\)", r"\1", heading)
+    plain = unicodedata.normalize("NFKD", plain).encode("ascii", "ignore").decode()
+    return re.sub(r"[-\s]+", "-", re.sub(r"[^\w\s-]", "", plain).strip().lower())
+
+
+def anchors(page: Path) -> set[str]:
+    text = FENCE.sub("", page.read_text(encoding="utf-8"))
+    headings = re.findall(r"^#{1,6} +(.*?) *#*$", text, re.MULTILINE)
+    return {slug(h) for h in headings} | set(re.findall(r'id="([^"]+)"', text))
+
+
+def broken_links(page: Path, text: str) -> list[str]:
+    """Relative links and pictures of `text` that lead nowhere."""
+    broken = []
+    plain = re.sub(r"`[^`\n]*`", "", FENCE.sub("", text))
+    for target in re.findall(r"\]\(([^()\s]+)(?: \"[^\"]*\")?\)", plain):
+        if re.match(r"[a-z]+:", target):
+            continue
+        name, _, anchor = target.partition("#")
+        path = (page.parent / name).resolve() if name else page
+        if not path.exists() or (anchor and anchor not in anchors(path)):
+            broken.append(target)
+    return broken
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_links_and_pictures_are_there(page: Path) -> None:
+    assert broken_links(page, page.read_text(encoding="utf-8")) == []
+
+
+def test_a_broken_link_is_found() -> None:
+    page = ROOT / "docs" / "index.md"
+    text = "[a](argate.md) [b](argate.md#nowhere) ![c](images/none.png) [d](https://x.org/y)"
+    assert broken_links(page, text) == ["argate.md#nowhere", "images/none.png"]
+
+
+def commands(text: str) -> list[str]:
+    """Commands of ours: lines of fenced or indented blocks, and whole ones in backticks."""
+    text = re.sub(r"\\\n\s*", " ", text)
+    lines = re.findall(
+        r"^(?:\s*\$ |\s*)((?:taskset -c \d+ )?python scripts/\S+\.py.*)$", text, re.M
+    )
+    inline = re.findall(r"`((?:taskset -c \d+ )?python\s+scripts/\w+\.py[^`]*)`", text)
+    found = [" ".join(c.split()) for c in [*(x for x in lines if "`" not in x), *inline]]
+    # Brackets hold options that may be left out; three dots, options that are explained beside.
+    found = [re.sub(r"\[(--[^\]]*)\]", r"\1", c) for c in found]
+    return [c for c in found if not re.search(r"\.\.\.(?=\s|$)", c)]
+
+
+def documented() -> list[tuple[str, str]]:
+    """(where, command), each command once."""
+    found: dict[str, str] = {}
+    texts = {page_name(page): page.read_text(encoding="utf-8") for page in PAGES}
+    for path in sorted((ROOT / "scripts").glob("*.py")):
+        texts[page_name(path)] = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
+    for where, text in texts.items():
+        for command in commands(text):
+            found.setdefault(command, where)
+    return [(where, command) for command, where in found.items()]
+
+
+COMMANDS = documented()
+
+
+def test_commands_are_found() -> None:
+    assert len(COMMANDS) > 60
+    text = "```\n$ python scripts/a.py --x 1 \\\n    --y 2   # why\n```\nand `python scripts/b.py`"
+    assert commands(text) == ["python scripts/a.py --x 1 --y 2 # why", "python scripts/b.py"]
+
+
+def parse(command: str) -> None:
+    """Build the configuration of the script from the options, without running it."""
+    words = shlex.split(command, comments=True)
+    words = words[words.index("python") + 1 :]
+    name, arguments = Path(words[0]).stem, words[1:]
+    module = importlib.import_module(f"scripts.{name}")
+    if name == "sweep" and arguments[:1] == ["show"]:
+        tyro.cli(module.Show, args=arguments[1:])
+        return
+    given = list(typing.get_type_hints(module.main).items())
+    if not inspect.signature(module.main).parameters:
+        assert arguments == [], f"{name} takes no options"
+        return
+    settings = getattr(module, "Command", given[0][1])
+    tyro.cli(settings, args=arguments)
+
+
+@pytest.mark.relaxed
+@pytest.mark.parametrize(
+    "script", sorted({shlex.split(c)[shlex.split(c).index("python") + 1] for _, c in COMMANDS})
+)
+def test_commands_parse(script: str, capsys: pytest.CaptureFixture[str]) -> None:
+    for where, command in COMMANDS:
+        if f" {script}" not in f" {command}":
+            continue
+        try:
+            parse(command)
+        except SystemExit:
+            message = capsys.readouterr()
+            pytest.fail(f"{where}: `{command}` does not parse: {message.out}{message.err}")
+        except ValueError as error:
+            pytest.fail(f"{where}: `{command}` is refused: {error}")
+
+
+# Commands of the documentation that take a minute or less; each is run as it stands.
+QUICK = (
+    "python scripts/train_argate.py --dataset simulated --model baseline",
+    "python scripts/sweep.py --study lif --grid drive=16:40:13 neuron.tau_m=10,20,40 --seeds 8 "
+    "--out runs/sweep_lif",
+    "python scripts/simulate_kitti.py --frames 4 --val 1 --test 0 --seed 3 "
+    "--out runs/kitti_picture --picture docs/images/kitti_simulated.png",
+    "python scripts/train_snn.py --scenario 1 --network S4 --preset quick",
+)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("command", QUICK, ids=lambda c: Path(c.split()[1]).stem)
+def test_quick_command_runs(command: str, tmp_path: Path) -> None:
+    known = [shlex.split(c, comments=True) for _, c in COMMANDS]
+    assert shlex.split(command) in known, "this command is not in the documentation any more"
+    words = shlex.split(command)[1:]
+    done = subprocess.run(
+        [sys.executable, str(ROOT / words[0]), *words[1:]],
+        cwd=tmp_path,
+        capture_output=True,
+        text=True,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr[-2000:]
+    assert done.stdout.strip().splitlines()[-1].startswith("result:")

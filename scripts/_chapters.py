@@ -16,7 +16,7 @@ from typing import Any
 from scripts import _fusion_tables, _run
 
 Written = dict[str, list[dict[str, Any]]]
-# Rows by table, and how many trainings or studies were done for them.
+# Rows by table, and how many trainings or studies were done or taken up again for them.
 Done = tuple[Written, int]
 
 SCENARIOS = {"2.3": 1, "2.4": 2, "2.5": 3}

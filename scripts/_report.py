@@ -113,7 +113,15 @@ def _details(held: dict[str, list[tuple[str, cells.Table]]], seconds: dict[str, 
     parts = [html.plain_table("Run details", header, rows)]
     if seconds:
         listed = "; ".join(f"Table {table}: {value:.0f} s" for table, value in seconds.items())
-        parts.append(tag("p", escape(f"The last quick run took, in wall time: {listed}.")))
+        parts.append(
+            tag(
+                "p",
+                escape(
+                    "The last quick run took, in wall time and less what was "
+                    f"there before: {listed}."
+                ),
+            )
+        )
     made = _run.provenance()
     parts.append(
         tag("p", "This page: ", tag("code", escape(made["command"])),

@@ -18,7 +18,7 @@ from typing import Any
 
 import tyro
 
-from scripts import _report, _run
+from scripts import _report, _report_cells, _run
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +76,14 @@ def sensor_fusion(config: Config) -> dict[str, Any]:
     }
 
 
+def _threshold_of_record(circuit: str, spec: str) -> float | None:
+    """The failure threshold that Table 4.1 or 4.2 was made with; None where there is none."""
+    numbers = {"ldo": "4.1", "dcdc": "4.2"}
+    table = _report_cells.load_tables(_run.RESULTS).get(numbers.get(circuit, ""), {"rows": []})
+    found = (row["threshold"] for row in table["rows"] if row["row"] == f"{spec} (box)")
+    return next(found, None)
+
+
 def failure_search(
     config: Config,
     *,
@@ -95,6 +103,7 @@ def failure_search(
     found = find_failures.main(
         find_failures.Config(
             circuit=circuit, spec=spec, method=method, seeds=2, n_total=n_total,
+            threshold=_threshold_of_record(circuit, spec),
             out=config.out / "failures", overwrite=True,
         )
     )  # fmt: skip

@@ -280,3 +280,26 @@ def test_collecting_from_single_runs(tmp_path: Path) -> None:
     page = Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
     (line, *_) = _line(page, "table-3.1", "clean: accuracy [%]", "Baseline (quick)")
     assert line[1:4] == ["94.06", "99.00", "✓ better"] and line[-1] == "quick run"
+
+
+@pytest.mark.relaxed  # the optimizer's own promotions
+def test_without_har_the_quick_piece_says_that_it_is_simulated(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.delenv("FUSION_DATA_DIR", raising=False)
+    monkeypatch.setenv("HOME", str(tmp_path))
+    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path))
+    plan = _chapters.Plan(
+        preset="quick", results=tmp_path / "results", piece=True, models=("baseline",),
+        data_dir=tmp_path, out=tmp_path,
+    )  # fmt: skip
+    written, runs = _chapters.sensor_fusion(plan, ("3.1",))
+    assert runs == 1 and "simulated windows instead of HAR" in capsys.readouterr().err
+    assert all(
+        row["row"].startswith("simulated windows (HAR not at hand)") for row in written["3.1"]
+    )
+    assert not any("source" in row for row in written["3.1"])
+    _, page = _page({"fresh": tmp_path / "results", "record": tmp_path / "none", "root": tmp_path})
+    heading = "simulated windows (HAR not at hand), 1 clean channel, uniform noise: accuracy [%]"
+    assert len(_line(page, "table-3.1", heading, "Baseline")) == 1
+    assert _chapters.sensor_fusion(plan, ("3.1",))[1] == 0

@@ -338,7 +338,9 @@ def reinforce(
     sign_pre, sign_hidden = (jnp.asarray(s) for s in neuron_signs(config))
     to_first, to_second = synapse_signs(sign_pre, sign_hidden)
     gamma, eta = active * params.gamma, active * params.homeostasis
-    by_neuron = gamma * jnp.repeat(reward, config.n_half)
+    # A product, so that the reward is worked out once and not anew for every synapse.
+    halves = jnp.repeat(jnp.eye(2), config.n_half, axis=1)
+    by_neuron = gamma * (reward @ halves)
     drives = Weights(
         hidden=to_first * by_neuron[None, :] * eligibility.hidden,
         output=(params.gamma_output * to_second * by_neuron).reshape(2, -1) * eligibility.output,

@@ -8,7 +8,7 @@ JOBS   ?= 2
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
 
-.PHONY: help demo test slow lint types docs wheel check clean
+.PHONY: help demo report test slow lint types docs wheel check clean
 .DEFAULT_GOAL := help
 
 help:  ## list the commands
@@ -29,6 +29,9 @@ $(VENV)/.dev: pyproject.toml
 demo: $(VENV)/.run  ## install what a run needs and show the main job, with pictures (<= 6 min)
 	@echo "== running the demo; pictures and numbers go to runs/demo"
 	$(BIN)/python scripts/demo.py
+
+report: $(VENV)/.run  ## run a small piece of each chapter and write report/index.html
+	$(BIN)/python scripts/reproduce.py --preset quick
 
 test: $(VENV)/.dev  ## install what the tests need and run the default suite (<= 15 min on two cores)
 	@echo "== running the default test suite on $(JOBS) workers"

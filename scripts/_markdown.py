@@ -32,10 +32,15 @@ def number(value: Any, unit: str = "") -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
+# The mean over the searches that found a failure says nothing of those that did not, and a worst
+# case of another circuit is no peer: the report judges the first by its median over all searches.
+NOT_JUDGED = ("first_failure_hit", "worst_case")
+
+
 def mark(row: Row) -> str | None:
     """`better`, `within` or `worse` than the source's number; None without one."""
     source, mean, interval = row.get("source"), row.get("mean"), row.get("ci95")
-    if not isinstance(source, int | float) or mean is None:
+    if not isinstance(source, int | float) or mean is None or row["metric"] in NOT_JUDGED:
         return None
     if interval is not None and interval[0] <= source <= interval[1]:
         return "within"

@@ -133,6 +133,8 @@ def command_line() -> str:
             argument = "$FUSION_DATA_DIR"
         elif argument == "--data-dir":
             skip = True
+        elif argument.startswith("/"):
+            argument = f"PATH/{Path(argument).name}"
         arguments.append(argument)
     return " ".join(["python", str(script), *arguments])
 

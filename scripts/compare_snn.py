@@ -5,7 +5,10 @@
 Reads `results/table_2_3.json` to `table_2_5.json`, in which seed `i` of every network drives from
 the same starts, and writes `results/study_paired_2_3.json` and so on: multiplicative against
 additive learning (S2 - S1, S4 - S3), and networks with inhibitory hidden neurons against those
-without (S3 - S1, S4 - S2), in points of the success rate in testing. A second.
+without (S3 - S1, S4 - S2), in points of the success rate in testing. From
+`results/study_snn_trials.json` and `results/study_rl.json` it collects in one table,
+`results/study_sample_efficiency.json`, after how many training trials at least 90 % of the testing
+trials arrive: spiking networks, PPO, Q-learning. A second.
 """
 
 from __future__ import annotations
@@ -49,6 +52,21 @@ def compare(table: dict[str, Any], metric: str) -> list[dict[str, Any]]:
     return rows
 
 
+def sample_efficiency(results: Path) -> list[dict[str, Any]]:
+    """Rows `trials_to_90` of all learners by scenario, from the studies that are there."""
+    rows = []
+    for name in ("study_snn_trials", "study_rl"):
+        path = results / f"{name}.json"
+        if not path.exists():
+            continue
+        held = json.loads(path.read_text(encoding="utf-8"))
+        for row in held["rows"]:
+            if row["metric"] == "trials_to_90":
+                command = {"command": row.get("command") or held["command"]}
+                rows.append(command | row | {"row": row["row"].removeprefix("trained on ")})
+    return rows
+
+
 def main(config: Compare) -> dict[str, int]:
     """Write the comparisons; returns how many each table has."""
     written = {}
@@ -66,6 +84,12 @@ def main(config: Compare) -> dict[str, int]:
                  "preset": table["preset"], **_run.provenance(), "rows": rows},
             )  # fmt: skip
         written[number] = len(rows)
+    rows = sample_efficiency(config.results)
+    if rows:
+        name = "study_sample_efficiency"
+        title = "Training trials until 90 % of the testing trials arrive"
+        path = config.results / f"{name}.json"
+        _run.record_table(path, name, title, rows, preset="paper")
     if not written:
         raise ValueError(
             f"{config.results} holds no table 2.3 to 2.5; run scripts/train_snn.py --record first"

@@ -37,10 +37,15 @@ def number(value: Any, unit: str = "") -> str:
 NOT_JUDGED = ("first_failure_hit", "worst_case")
 
 
+def judgeable(row: Row) -> Row:
+    """The row, with `judged` false where its mean must not be compared with the source's number."""
+    return row | {"judged": False} if row["metric"] in NOT_JUDGED else row
+
+
 def mark(row: Row) -> str | None:
     """`better`, `within` or `worse` than the source's number; None without one."""
     source, mean, interval = row.get("source"), row.get("mean"), row.get("ci95")
-    if not isinstance(source, int | float) or mean is None or row["metric"] in NOT_JUDGED:
+    if not isinstance(source, int | float) or mean is None or not row.get("judged", True):
         return None
     if interval is not None and interval[0] <= source <= interval[1]:
         return "within"

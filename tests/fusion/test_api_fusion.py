@@ -270,7 +270,7 @@ CASES = [
     ),
     Case(
         "detection.encodings.box3d_to_box4c",
-        lambda b: encodings.box3d_to_box4c(b, PLANE),
+        lambda b: encodings.box3d_to_box4c(b, jnp.asarray(PLANE)),
         lambda rng: (boxes(rng),),
     ),
     Case(

@@ -181,12 +181,7 @@ def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Done:
         title, _ = _fusion_tables.TABLES[table]
         plan.record(table, title, rows)
         if studies:
-            name = table.replace(".", "_")
-            study = {"table": table, "title": f"{title}: paired comparisons", "rows": studies}
-            _run.write_json(
-                plan.results / f"study_paired_{name}.json",
-                study | {"preset": plan.preset} | _run.provenance(),
-            )
+            _run.record_comparisons(plan.results, table, title, studies, preset=plan.preset)
         written[table] = rows
     return written, len(todo)
 

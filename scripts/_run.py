@@ -205,6 +205,17 @@ def record_table(
     )
 
 
+def record_comparisons(
+    results: Path, table: str, title: str, rows: list[dict[str, Any]], *, preset: str
+) -> None:
+    """Write the paired comparisons of a table of record beside it, as `study_paired_N.json`."""
+    write_json(
+        results / f"study_paired_{table.replace('.', '_')}.json",
+        {"table": table, "title": f"{title}: paired comparisons", "rows": rows, "preset": preset}
+        | provenance(),
+    )
+
+
 def progress() -> Any:
     """A rich progress bar on stderr, so that stdout stays clean for `result:`."""
     from rich.console import Console

@@ -78,11 +78,9 @@ def main(config: Compare) -> dict[str, int]:
         table = json.loads(path.read_text(encoding="utf-8"))
         rows = compare(table, config.metric)
         if rows:
-            _run.write_json(
-                config.results / f"study_paired_{name}.json",
-                {"table": number, "title": f"{table['title']}: paired comparisons",
-                 "preset": table["preset"], **_run.provenance(), "rows": rows},
-            )  # fmt: skip
+            _run.record_comparisons(
+                config.results, number, table["title"], rows, preset=table["preset"]
+            )
         written[number] = len(rows)
     rows = sample_efficiency(config.results)
     if rows:

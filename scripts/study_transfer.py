@@ -23,6 +23,7 @@ from typing import Any, Literal
 import tyro
 
 from scripts import _run
+from scripts.train_snn import learning_circles, seed_keys
 
 CHECKPOINTS = (1, 2, 3, 5, 10, 20, 40)
 MAP_KEY = 2_000_000
@@ -49,20 +50,6 @@ class Transfer:
     """Write the rows into results/."""
 
 
-def _keys(seeds: int) -> Any:
-    import jax
-    import jax.numpy as jnp
-
-    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(0), i))(jnp.arange(seeds))
-
-
-def _circles(scenario: int, n: int) -> Any:
-    import jax.numpy as jnp
-
-    # The source: half of Scenario 2's learning trials from each circle.
-    return jnp.arange(n) % 2 if scenario == 2 else None
-
-
 def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     """Percent of unseen maps solved by each robot, of robots that solve each map, path ratios."""
     import jax
@@ -77,7 +64,7 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     root = jax.random.key(MAP_KEY)
     unseen = [maps.random_map(jax.random.fold_in(root, i)) for i in range(config.maps)]
     stacked = maps.stack_maps(unseen)
-    keys = _keys(config.seeds)
+    keys = seed_keys(jnp.arange(config.seeds))
     params = jax.tree.map(jnp.float32, agents.snn_params(built, constants))
     frozen = agents.snn_agent(built, plastic=False)
 
@@ -85,7 +72,7 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     def learn(keys: Any, params: Any) -> Any:
         return trials.run_experiment(
             built, params, place, keys, n_learn=20, n_test=1, max_steps=config.max_steps,
-            block=config.block, circles=_circles(scenario, 20), keep_states=True,
+            block=config.block, circles=learning_circles(scenario, 20), keep_states=True,
         ).states  # fmt: skip
 
     def test_keys(keys: Any, i: Any) -> Any:
@@ -135,7 +122,7 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
     built, constants = network_setting(config.network, config.setting)
     place = scenarios.scenario(scenario)
     params = jax.tree.map(jnp.float32, agents.snn_params(built, constants))
-    keys = _keys(config.seeds)
+    keys = seed_keys(jnp.arange(config.seeds))
     values: dict[str, list[float]] = {}
     columns = []
     for n in CHECKPOINTS:
@@ -143,7 +130,8 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
         run = jax.jit(
             lambda keys, params, n=n: trials.run_experiment(
                 built, params, place, keys, n_learn=n, n_test=config.test_trials,
-                max_steps=config.max_steps, block=config.block, circles=_circles(scenario, n),
+                max_steps=config.max_steps, block=config.block,
+                circles=learning_circles(scenario, n),
             ).testing.status
         )  # fmt: skip
         column = (np.asarray(run(keys, params)) == trials.ARRIVED).mean(axis=1)

@@ -87,6 +87,20 @@ def parse_changes(changes: tuple[str, ...]) -> dict[str, dict[str, Any]]:
     return parts
 
 
+def seed_keys(seeds: Any) -> Any:
+    """Key of each seed `[n]`: the same robot in every table and study."""
+    import jax
+
+    return jax.vmap(lambda i: jax.random.fold_in(jax.random.key(0), i))(seeds)
+
+
+def learning_circles(scenario: int, n_learn: int) -> Any:
+    """Start circles of the learning trials: Scenario 2's in turn, as the source; None is random."""
+    import jax.numpy as jnp
+
+    return jnp.arange(n_learn) % 2 if scenario == 2 else None
+
+
 def make_runner(
     config: Any, scenario: int, *, n_learn: int, n_test: int, n_online: int, max_steps: int,
     block: int, record: bool, keep_states: bool = False,
@@ -101,12 +115,11 @@ def make_runner(
     from jaxsnn.trials import run_experiment
 
     place = scenarios.scenario(scenario)
-    # The source: half of Scenario 2's learning trials from each circle.
-    circles = jnp.arange(n_learn) % 2 if scenario == 2 else None
+    circles = learning_circles(scenario, n_learn)
 
     @jax.jit
     def run(numbers: Any, params: Any) -> Any:
-        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(0), i))(numbers)
+        keys = seed_keys(numbers)
         return run_experiment(
             config, snn_params(config, params), place, keys,
             n_learn=n_learn, n_test=n_test, n_online=n_online, max_steps=max_steps, block=block,
@@ -166,7 +179,7 @@ def shortest_paths(numbers: list[int], scenario: int, n_test: int) -> list[list[
 
     @jax.jit
     def starts(seeds: Any) -> Any:
-        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(0), i))(seeds)
+        keys = seed_keys(seeds)
         found = jax.vmap(lambda k: start_states(phase_keys(k)[2], place, n_test))(keys)
         return jnp.stack([found.x, found.y], axis=-1)
 

@@ -19,7 +19,7 @@ from jaxsnn.architecture import check_network
 from jaxsnn.settings import network_setting
 from jaxsnn.trials import ARRIVED, NON_FINITE, TrialResult, run_experiment
 from scripts._sweep.study import Metric, Study
-from scripts.train_snn import TEST_TRIALS, parse_changes
+from scripts.train_snn import TEST_TRIALS, learning_circles, parse_changes
 
 __all__ = ["make"]
 
@@ -55,8 +55,7 @@ def make(
         raise ValueError(f"{n_learn=}, {n_test=}, {max_steps=}: expected at least 1")
     config, constants = network_setting(network, setting, **parse_changes(tuple(changes)))
     place = scenarios.scenario(scenario)
-    # The source: half of Scenario 2's learning trials from each circle.
-    circles = jnp.arange(n_learn) % 2 if scenario == 2 else None
+    circles = learning_circles(scenario, n_learn)
 
     def run(params: Any, keys: Any) -> dict[str, Any]:
         prepared = jax.vmap(lambda p: snn_params(config, p))(params)

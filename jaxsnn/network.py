@@ -172,15 +172,16 @@ def settle(params: NetworkParams, state: NetworkState, fresh: Bool[Array, ""]) -
 def _fire(
     config: NetworkConfig,
     params: NetworkParams,
-    state: NetworkState,
+    hidden: LIFState,
+    output: LIFState,
     jump: Float[Array, " n_hidden"],
     signed_output: Float[Array, "2 n_half"],
 ) -> tuple[LIFState, LIFState, Spikes]:
     """One step of both layers of neurons, given what the inputs add to the hidden layer."""
-    hidden, fired = lif_step(params.hidden, state.hidden, 0.0, jump, dt=config.dt)
+    hidden, fired = lif_step(params.hidden, hidden, 0.0, jump, dt=config.dt)
     spikes = fired.astype(jnp.float32)
     to_motor = jnp.sum(signed_output * spikes.reshape(2, config.n_half), axis=1)
-    output, motor = lif_step(params.output, state.output, 0.0, to_motor, dt=config.dt)
+    output, motor = lif_step(params.output, output, 0.0, to_motor, dt=config.dt)
     return hidden, output, Spikes(hidden=spikes, output=motor.astype(jnp.float32))
 
 
@@ -211,7 +212,7 @@ def step(
     weights = state.weights
     jump = params.gain_input * ((pre * sign_pre) @ weights.hidden)
     hidden, output, spikes = _fire(
-        config, params, state, jump, _signed_output(config, params, weights)
+        config, params, state.hidden, state.output, jump, _signed_output(config, params, weights)
     )
     first, second = _centred(params, state, pre, spikes.hidden)
     stdp_hidden = stdp_step(params.stdp, state.stdp_hidden, first, spikes.hidden, dt=config.dt)
@@ -248,14 +249,15 @@ def fire(
     jumps = params.gain_input * ((pre * sign_pre[None, :]) @ state.weights.hidden)
     signed_output = _signed_output(config, params, state.weights)
 
-    def body(carry: NetworkState, jump: Array) -> tuple[NetworkState, Spikes]:
-        hidden, output, spikes = _fire(config, params, carry, jump, signed_output)
-        return carry._replace(hidden=hidden, output=output), spikes
-
     # Only the membranes go round the loop: synapses in the carry would be copied.
-    small = state._replace(weights=None, stdp_hidden=None, stdp_output=None)  # type: ignore[arg-type]
-    small, spikes = jax.lax.scan(body, small, jumps)
-    return state._replace(hidden=small.hidden, output=small.output), spikes
+    def body(
+        carry: tuple[LIFState, LIFState], jump: Array
+    ) -> tuple[tuple[LIFState, LIFState], Spikes]:
+        hidden, output, spikes = _fire(config, params, *carry, jump, signed_output)
+        return (hidden, output), spikes
+
+    (hidden, output), spikes = jax.lax.scan(body, (state.hidden, state.output), jumps)
+    return state._replace(hidden=hidden, output=output), spikes
 
 
 def window(

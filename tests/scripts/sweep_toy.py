@@ -10,6 +10,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+import xarray as xr
 
 from scripts._sweep.chunks import run_shard
 from scripts._sweep.folder import held_sweep
@@ -82,3 +83,16 @@ def work_logged(out: str, log: str) -> None:
             file.write(f"{number}\n")
 
         run_shard(held_sweep(Path(out)), on_start=begun)
+
+
+def load(out: Path) -> xr.Dataset:
+    """The results of a finished sweep."""
+    with xr.open_dataset(out / "results.nc") as data:
+        return data.load()
+
+
+def same(a: xr.Dataset, b: xr.Dataset, *names: str) -> None:
+    """Two sweeps' results are equal bit for bit, in these variables."""
+    assert names
+    for name in names:
+        np.testing.assert_array_equal(a[name], b[name], err_msg=name)

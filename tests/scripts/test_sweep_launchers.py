@@ -4,19 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from pathlib import Path
 
-import numpy as np
 import pytest
 import xarray as xr
 
 from scripts import sweep
 from scripts._sweep import launchers
-from tests.scripts.sweep_toy import NAME
+from tests.scripts.sweep_toy import NAME, load, same
 
 # Ray and submitit warn about what is not ours to mend.
 pytestmark = pytest.mark.filterwarnings("ignore")
 
+VARIABLES = ("value", "time", "positive", "status")
 CONFIG = sweep.Config(
     study=NAME, options=("delay=0.02",), grid=("a=1:2:10", "b=1,2"), seeds=3, chunk_size="2",
     chunk_trials=4, quiet=True,
@@ -30,20 +29,10 @@ def alone(tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset:
     return load(out)
 
 
-def load(out: Path) -> xr.Dataset:
-    with xr.open_dataset(out / "results.nc") as data:
-        return data.load()
-
-
-def same(a: xr.Dataset, b: xr.Dataset) -> None:
-    for name in ("value", "time", "positive", "status"):
-        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
-
-
 def test_local_workers(alone, tmp_path) -> None:
     result = sweep.main(dataclasses.replace(CONFIG, out=tmp_path, workers=2))
     assert result["complete"] and result["failed"] == 0
-    same(load(tmp_path), alone)
+    same(load(tmp_path), alone, *VARIABLES)
 
 
 def test_a_local_worker_that_dies_is_reported(alone, tmp_path) -> None:
@@ -57,7 +46,7 @@ def test_a_local_worker_that_dies_is_reported(alone, tmp_path) -> None:
     assert len(errors) == 1 and errors[0].endswith("ended with status -9")
     assert not sweep.summary(made)["complete"]
     assert sweep.main(config)["complete"]
-    same(load(tmp_path / "out"), alone)
+    same(load(tmp_path / "out"), alone, *VARIABLES)
 
 
 def test_submitit_array(alone, tmp_path) -> None:
@@ -68,7 +57,7 @@ def test_submitit_array(alone, tmp_path) -> None:
     result = sweep.main(config)
     assert result["complete"] and result["failed"] == 0
     assert len(list((tmp_path / "jobs").glob("*_result.pkl"))) == 2
-    same(load(tmp_path), alone)
+    same(load(tmp_path), alone, *VARIABLES)
 
 
 def test_ray_goes_on_when_a_worker_is_killed(alone, tmp_path, monkeypatch) -> None:
@@ -89,4 +78,4 @@ def test_ray_goes_on_when_a_worker_is_killed(alone, tmp_path, monkeypatch) -> No
     assert errors == []
     assert len(set(pids)) >= 2 and pids[0] not in pids[1:]
     assert sweep.summary(made)["complete"]
-    same(load(tmp_path), alone)
+    same(load(tmp_path), alone, *VARIABLES)

@@ -8,12 +8,13 @@ import subprocess
 import sys
 from pathlib import Path
 
-import numpy as np
 import pytest
 import xarray as xr
 
 from scripts import _run, sweep
+from tests.scripts.sweep_toy import load, same
 
+VARIABLES = ("rate", "error", "status")
 ARGS = [
     "scripts/sweep.py", "--study", "lif", "--options", "steps=60", "--grid", "drive=18:40:5",
     "tau_m=5,20,40", "--seeds", "3", "--chunk-trials", "10", "--quiet",
@@ -33,11 +34,6 @@ def one_device(tmp_path_factory: pytest.TempPathFactory) -> xr.Dataset:
     return load(out)
 
 
-def load(out: Path) -> xr.Dataset:
-    with xr.open_dataset(out / "results.nc") as data:
-        return data.load()
-
-
 def start(out: Path, *args: str, devices: int = 1, **extra: str) -> subprocess.Popen:
     flags = f"{os.environ.get('XLA_FLAGS', '')} --xla_force_host_platform_device_count={devices}"
     env = {**os.environ, "XLA_FLAGS": flags, "JAX_PLATFORMS": "cpu", **extra}
@@ -53,16 +49,11 @@ def ended(process: subprocess.Popen) -> str:
     return out
 
 
-def same(a: xr.Dataset, b: xr.Dataset) -> None:
-    for name in ("rate", "error", "status"):
-        np.testing.assert_array_equal(a[name], b[name], err_msg=name)
-
-
 def test_two_devices_are_one_device(one_device, tmp_path) -> None:
     """Chunks of 10 trials do not divide by two devices times 3."""
     text = ended(start(tmp_path, "--chunk-size", "3", devices=2))
     assert text.splitlines()[-1].startswith("result: complete=True trials=45 of=45")
-    same(load(tmp_path), one_device)
+    same(load(tmp_path), one_device, *VARIABLES)
 
 
 def test_two_processes_are_one_process(one_device, tmp_path) -> None:
@@ -79,4 +70,4 @@ def test_two_processes_are_one_process(one_device, tmp_path) -> None:
     ]  # fmt: skip
     texts = [ended(p) for p in processes]
     assert "complete=True trials=45" in texts[0]
-    same(load(tmp_path), one_device)
+    same(load(tmp_path), one_device, *VARIABLES)

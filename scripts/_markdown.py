@@ -32,20 +32,27 @@ def number(value: Any, unit: str = "") -> str:
     return f"{value:,.0f}" if abs(value) >= 1000 else f"{value:.4g}"
 
 
-# The mean over the searches that found a failure says nothing of those that did not, and a worst
-# case of another circuit is no peer: the report judges the first by its median over all searches.
-NOT_JUDGED = ("first_failure_hit", "worst_case")
+CENTRES = {"first_failure_hit": "median"}
+"""Scores that are judged by another centre than their mean: the mean of the searches that found a
+failure says nothing of those that did not, while the median over all searches counts them."""
+INCOMPARABLE = {"worst_case": "not judged, since the circuit is another"}
+"""Scores that no mark is given for, and why."""
 
 
-def judgeable(row: Row) -> Row:
-    """The row, with `judged` false where its mean must not be compared with the source's number."""
-    return row | {"judged": False} if row["metric"] in NOT_JUDGED else row
+def judged(metric: str, centre: str = "mean") -> bool:
+    """May this centre of a score be compared with the source's number?"""
+    return metric not in INCOMPARABLE and CENTRES.get(metric, "mean") == centre
 
 
-def mark(row: Row) -> str | None:
-    """`better`, `within` or `worse` than the source's number; None without one."""
+def mark(row: Row, centre: str = "mean") -> str | None:
+    """`better`, `within` or `worse` than the source's number; None without one.
+
+    Args:
+        row: `metric`, `source`, `mean` and `ci95`.
+        centre: what `mean` is: the "mean" over seeds, as in the rows of record, or their "median".
+    """
     source, mean, interval = row.get("source"), row.get("mean"), row.get("ci95")
-    if not isinstance(source, int | float) or mean is None or not row.get("judged", True):
+    if not isinstance(source, int | float) or mean is None or not judged(row["metric"], centre):
         return None
     if interval is not None and interval[0] <= source <= interval[1]:
         return "within"

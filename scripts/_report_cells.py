@@ -24,11 +24,6 @@ SCORE_UNITS = {"sr_learning": "%", "sr_testing": "%", "n_mv": "steps"}
 # Printed units with a prefix, as a factor on the SI value of a row of record.
 PREFIXED = {"mA": 1e3, "mV": 1e3}
 
-INCOMPARABLE = {
-    "worst_case": "not judged, since the circuit is another",
-}
-"""Scores that no mark is given for, and why."""
-
 
 @dataclasses.dataclass(frozen=True)
 class Printed:
@@ -60,6 +55,7 @@ class Measured:
         interval: 95 %; None with too few seeds.
         note: what a reader has to know beside it.
         origin: such as "this run" or "record".
+        kind: what the centre is, "mean" or "median".
     """
 
     centre: float | None
@@ -67,6 +63,7 @@ class Measured:
     n: int
     note: str
     origin: str
+    kind: str = "mean"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -158,6 +155,7 @@ def measure(row: Row, origin: str, scale: float = 1.0) -> Measured:
             n,
             f"found in {found} of {len(hits)}",
             origin,
+            "median",
         )
     mean, interval = row.get("mean"), row.get("ci95")
     return Measured(
@@ -171,8 +169,6 @@ def measure(row: Row, origin: str, scale: float = 1.0) -> Measured:
 
 def verdict(printed: Printed, ours: Measured) -> str | None:
     """`better`, `within` or `worse` than the source; None where it may not be said."""
-    if printed.metric in INCOMPARABLE or ours.centre is None:
-        return None
     source = printed.value
     if source is None:
         # The source found no failure in its budget: later than any number.
@@ -185,7 +181,8 @@ def verdict(printed: Printed, ours: Measured) -> str | None:
             "source": source,
             "mean": ours.centre,
             "ci95": ours.interval,
-        }
+        },
+        ours.kind,
     )
 
 

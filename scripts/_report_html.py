@@ -14,7 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from scripts import _markdown
-from scripts._report_cells import INCOMPARABLE, Cell, Measured, Printed, Row, verdict
+from scripts._report_cells import Cell, Measured, Printed, Row, verdict
 
 SIGNS = {"better": "✓", "within": "≈", "worse": "✗", "not judged": "–", "not run": "○"}
 
@@ -82,8 +82,8 @@ def score(metric: str, unit: str) -> str:
     """Name, unit and good direction of a score, as text."""
     name, direction = SCORES.get(metric, (metric.replace("_", " "), 0))
     unit = "" if unit in ("", "1") else f" [{unit}]"
-    if metric in INCOMPARABLE:
-        return f"{name}{unit}, {INCOMPARABLE[metric]}"
+    if metric in _markdown.INCOMPARABLE:
+        return f"{name}{unit}, {_markdown.INCOMPARABLE[metric]}"
     return f"{name}{unit}" + {1: ", higher is better", -1: ", lower is better", 0: ""}[direction]
 
 

@@ -141,7 +141,7 @@ def table_section(config: Config, path: Path, source: dict[str, Any]) -> str:
     """A table of record as a section, with its paired comparisons."""
     table = _load(path)
     name = str(table["table"])
-    rows = [_markdown.judgeable(row) for row in table["rows"]]
+    rows = table["rows"]
     parts = [
         f"## Table {name}: {table['title']}",
         _markdown.tally_line(rows),
@@ -194,8 +194,7 @@ def headlines(config: Config, source: dict[str, Any]) -> str:
     lines, counts = [], {"better": 0, "within": 0, "worse": 0}
     for path in files(config.results)[0]:
         table = _load(path)
-        judged = [_markdown.judgeable(row) for row in table["rows"]]
-        rows = _markdown.in_order(judged, source.get(str(table["table"])))
+        rows = _markdown.in_order(table["rows"], source.get(str(table["table"])))
         rows = [row for row in rows if _markdown.mark(row) is not None]
         for name, n in _markdown.tally(rows).items():
             counts[name] += n

@@ -86,12 +86,21 @@ def _line(text: str, *parts: str) -> str:
         ("accuracy", 97.0, None, 97.0, "within"),
         ("n_mv", 40.0, [38.0, 42.0], 46.0, "better"),
         ("n_mv", 50.0, [48.0, 52.0], 46.0, "worse"),
-        ("first_failure_hit", 120.0, None, 206, "better"),
+        # A mean over the searches that found a failure, and another circuit's volts: no peers.
+        ("first_failure_hit", 120.0, None, 206, None),
+        ("worst_case", 120.0, [110.0, 130.0], 206, None),
     ],
 )
-def test_marks(metric: str, mean: float, interval: Any, source: float, verdict: str) -> None:
+def test_marks(metric: str, mean: float, interval: Any, source: float, verdict: str | None) -> None:
     row = {"metric": metric, "mean": mean, "ci95": interval, "source": source}
     assert _markdown.mark(row) == verdict
+
+
+def test_a_first_failure_is_judged_by_its_median_only() -> None:
+    row = {"metric": "first_failure_hit", "mean": 120.0, "ci95": [100.0, 130.0], "source": 206}
+    assert _markdown.mark(row) is None
+    assert _markdown.mark(row, "median") == "better"
+    assert _markdown.mark(row | {"metric": "n_mv"}, "median") is None
 
 
 def test_no_mark_without_a_number_of_the_source() -> None:

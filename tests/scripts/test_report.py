@@ -234,8 +234,9 @@ def test_median_interval() -> None:
 
 def test_no_failure_in_the_source_is_later_than_any() -> None:
     printed = cells.Printed("a", "b", "first_failure_hit", "", None, "none in 300")
-    ours = cells.Measured(60.0, (55.0, 70.0), 20, "", "record")
+    ours = cells.Measured(60.0, (55.0, 70.0), 20, "", "record", "median")
     assert cells.verdict(printed, ours) == "better"
+    assert cells.verdict(printed, dataclasses.replace(ours, kind="mean")) is None
     none = dataclasses.replace(ours, centre=math.inf, interval=(55.0, math.inf))
     assert cells.verdict(printed, none) == "within"
     late = dataclasses.replace(printed, value=40.0)

@@ -1,7 +1,8 @@
 """Frames prepared once: examples of fixed size on disk, anchor sizes from the labels, counts.
 
-A cache folder holds `000000.npz` for each frame and `cache.json` with preset, splits, anchor sizes
-and what was left out.
+A cache folder holds `000000.npz` for each frame (of the benchmark's testing part, whose names come
+again, `testing/000000.npz`) and `cache.json` with preset, splits, anchor sizes and what was left
+out.
 """
 
 from __future__ import annotations
@@ -20,7 +21,24 @@ from fusion.detection.examples import Example, make_example
 from fusion.detection.io import frame_names, read_frame, read_labels, read_split
 from fusion.detection.settings import CAR_SIZES, DetectorConfig, detector_preset
 
-__all__ = ["Cache", "open_cache", "prepare_cache", "read_example", "split_frames", "write_example"]
+__all__ = [
+    "TESTING",
+    "Cache",
+    "frame_part",
+    "open_cache",
+    "prepare_cache",
+    "read_example",
+    "split_frames",
+    "write_example",
+]
+
+TESTING = "testing"
+"""The split of all frames in `ROOT/testing`, which have no labels; not a list of `ImageSets`."""
+
+
+def frame_part(split: str) -> str:
+    """The folder below ROOT that a split's frames are in: `training` or `testing`."""
+    return TESTING if split == TESTING else "training"
 
 
 @dataclasses.dataclass(frozen=True)
@@ -52,7 +70,24 @@ class Cache:
 
     def read(self, split: str) -> list[Example]:
         """All examples of a split, in memory."""
-        return [read_example(self.folder, name) for name in self.splits[split]]
+        return [read_example(self.examples(split), name) for name in self.names(split)]
+
+    def examples(self, split: str) -> Path:
+        """Folder of a split's examples."""
+        return self.folder / TESTING if split == TESTING else self.folder
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Frames of a split.
+
+        Raises:
+            ValueError: it was not prepared.
+        """
+        if split not in self.splits:
+            raise ValueError(
+                f"{self.folder} has the splits {', '.join(self.splits)}, not {split!r}: run "
+                f"`prepare --add --splits {split}`"
+            )
+        return self.splits[split]
 
 
 def write_example(folder: Path, name: str, example: Example) -> None:
@@ -75,23 +110,42 @@ def read_example(folder: Path, name: str) -> Example:
 
 
 def split_frames(root: Path, splits: Sequence[str]) -> tuple[dict[str, tuple[str, ...]], int]:
-    """Frames of each split list that are on disk, and how many listed ones are not.
+    """Frames of each split that are on disk, and how many listed ones are not.
+
+    Args:
+        root: KITTI folder.
+        splits: lists of `ImageSets`, or `testing` for all frames of `ROOT/testing`.
 
     Raises:
         FileNotFoundError: a list or the image folder is missing.
-        ValueError: none of a list's frames is there.
+        ValueError: none of a list's frames is there, or the list of test frames has training ones.
     """
-    images = set(frame_names(root / "training" / "image_2", ".png"))
     found: dict[str, tuple[str, ...]] = {}
     missing = 0
     for split in splits:
-        listed = read_split(root / "ImageSets" / f"{split}.txt")
-        found[split] = tuple(name for name in listed if name in images)
+        folder = root / frame_part(split) / "image_2"
+        images = frame_names(folder, ".png")
+        # All of `testing` there is; a list of it would only repeat the folder.
+        listed = images if split == TESTING else read_split(root / "ImageSets" / f"{split}.txt")
+        present = set(images)
+        found[split] = tuple(name for name in listed if name in present)
         missing += len(listed) - len(found[split])
         if not found[split]:
+            where = folder.relative_to(root)
+            if split == TESTING:
+                raise ValueError(f"{root}: no image in {where}")
             raise ValueError(
                 f"{root}: none of the {len(listed)} frames of ImageSets/{split}.txt has an image "
-                "in training/image_2"
+                f"in {where}"
+            )
+    train = root / "ImageSets" / "train.txt"
+    if "test" in found and train.is_file():
+        shared = set(found["test"]) & set(read_split(train))
+        if shared:
+            raise ValueError(
+                f"{root}: {len(shared)} frames of ImageSets/test.txt are in train.txt too, such as "
+                f"{min(shared)}: the benchmark's test list names frames of the folder `testing`, "
+                "whose split is called `testing`"
             )
     return found, missing
 
@@ -112,12 +166,48 @@ def _anchor_sizes(
     return tuple((float(a), float(b), float(c)) for a, b, c in centres)
 
 
+def _read_frames(
+    root: Path,
+    folder: Path,
+    config: DetectorConfig,
+    frames: Sequence[tuple[str, str]],
+    *,
+    any_size: bool,
+    skip_bad: bool,
+    on_frame: Callable[[int, int, str], None] | None,
+) -> dict[str, Any]:
+    """Write the examples of (part, name); returns counts of what was left out."""
+    counts: dict[str, Any] = {
+        "skipped": {}, "plane_fitted": 0, "points_dropped": 0, "labels_dropped": 0,
+    }  # fmt: skip
+    for done, (part, name) in enumerate(frames):
+        try:
+            frame = read_frame(root, name, part=part, any_size=any_size)
+            example, left_out = make_example(frame, config)
+        except (ValueError, FileNotFoundError) as error:
+            if not skip_bad:
+                raise
+            counts["skipped"][_skip_key(part, name)] = str(error)
+            continue
+        for key, value in left_out.items():
+            counts[key] += int(value)
+        write_example(folder / TESTING if part == TESTING else folder, name, example)
+        if on_frame is not None:
+            on_frame(done + 1, len(frames), name)
+    return counts
+
+
+def _skip_key(part: str, name: str) -> str:
+    return f"{part}/{name}" if part == TESTING else name
+
+
 def prepare_cache(
     root: Path,
     folder: Path,
     preset: str,
     *,
     splits: Sequence[str] = ("train", "val"),
+    add: bool = False,
     any_size: bool = False,
     skip_bad: bool = False,
     on_frame: Callable[[int, int, str], None] | None = None,
@@ -125,47 +215,53 @@ def prepare_cache(
     """Read every frame of the split lists, check it, and write its example.
 
     Args:
-        root: KITTI folder (`training`, `ImageSets`).
+        root: KITTI folder (`training`, `ImageSets`; `testing` for the split of that name).
         folder: of the cache.
         preset: of the detector.
         splits: lists to read; the first one gives the anchor sizes.
+        add: add the lists to the cache that is there, whose lists and anchor sizes stay.
         any_size: accept images of other sizes than the benchmark's.
         skip_bad: leave out frames that cannot be used, and count them, instead of stopping.
         on_frame: called with (done, all, name).
 
     Raises:
-        FileNotFoundError: a folder, list or (unless `skip_bad`) a file of a frame is missing.
-        ValueError: (unless `skip_bad`) a frame is damaged; or nothing is left of a split.
+        FileNotFoundError: a folder, list or (unless `skip_bad`) a file of a frame is missing; or
+            there is no cache to add to.
+        ValueError: (unless `skip_bad`) a frame is damaged; nothing is left of a split; the cache to
+            add to has another preset or one of the lists; or `testing`, which has no labels, would
+            have to give the anchor sizes.
     """
     config = detector_preset(preset)
+    held = open_cache(folder) if add else None
+    if held is not None and (held.preset != preset or set(splits) & set(held.splits)):
+        raise ValueError(
+            f"{folder} has preset {held.preset!r} and the splits {', '.join(held.splits)}: cannot "
+            f"add {', '.join(splits)} of preset {preset!r}; prepare all in another cache folder"
+        )
+    if held is None and splits[0] == TESTING:
+        raise ValueError(
+            f"{folder}: testing frames have no labels to take anchor sizes from: prepare the "
+            "training list first"
+        )
     found, missing = split_frames(root, splits)
-    everything = sorted({name for names in found.values() for name in names})
-    counts: dict[str, Any] = {
-        "missing": missing, "skipped": {}, "plane_fitted": 0, "points_dropped": 0,
-        "labels_dropped": 0,
-    }  # fmt: skip
-    for done, name in enumerate(everything):
-        try:
-            example, left_out = make_example(read_frame(root, name, any_size=any_size), config)
-        except (ValueError, FileNotFoundError) as error:
-            if not skip_bad:
-                raise
-            counts["skipped"][name] = str(error)
-            continue
-        for key, value in left_out.items():
-            counts[key] += int(value)
-        write_example(folder, name, example)
-        if on_frame is not None:
-            on_frame(done + 1, len(everything), name)
+    everything = sorted({(frame_part(split), name) for split in found for name in found[split]})
+    counts = {"missing": missing} | _read_frames(
+        root, folder, config, everything, any_size=any_size, skip_bad=skip_bad, on_frame=on_frame
+    )
     kept = {
-        split: tuple(name for name in names if name not in counts["skipped"])
+        split: tuple(n for n in names if _skip_key(frame_part(split), n) not in counts["skipped"])
         for split, names in found.items()
     }
     for split, names in kept.items():
         if not names:
             first = next(iter(counts["skipped"].values()))
             raise ValueError(f"every frame of the split {split} was skipped; the first: {first}")
-    sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes))
+    if held is None:
+        sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes))
+    else:
+        sizes, kept = held.sizes, held.splits | kept
+        skipped = held.counts["skipped"] | counts.pop("skipped")
+        counts = {k: n + held.counts[k] for k, n in counts.items()} | {"skipped": skipped}
     cache = Cache(folder, root, preset, kept, sizes, counts)
     record = dataclasses.asdict(cache) | {"folder": str(folder), "root": str(root)}
     temporary = folder / ".cache.json"

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -9,7 +10,7 @@ import numpy as np
 import pytest
 from PIL import Image
 
-from fusion.detection.cache import open_cache, read_example, split_frames
+from fusion.detection.cache import open_cache, prepare_cache, read_example, split_frames
 from fusion.detection.calibration import Calibration
 from fusion.detection.io import (
     read_results,
@@ -83,6 +84,50 @@ def test_prepare_counts_what_it_leaves_out(root: Path, capsys: pytest.CaptureFix
     assert len(cache.read("train")) == 2
 
 
+def move_to_testing(root: Path, name: str) -> None:
+    """Make a frame one of the testing part: no labels, no plane."""
+    for part in ("image_2", "velodyne", "calib"):
+        (file,) = (root / "training" / part).glob(f"{name}.*")
+        (root / "testing" / part).mkdir(parents=True, exist_ok=True)
+        file.rename(root / "testing" / part / file.name)
+
+
+def test_lists_are_added_to_a_cache(root: Path) -> None:
+    folder = root / "cache_tiny"
+    lists = root / "ImageSets"
+    for name in ("000000", "000004"):
+        write_frame(root, name, 5)
+        move_to_testing(root, name)
+    write_frame(root, "000000", 0)
+    with pytest.raises(ValueError, match="testing frames have no labels to take anchor sizes"):
+        prepare_cache(root, folder, "tiny", splits=("testing", "train"))
+    with pytest.raises(FileNotFoundError, match="run `prepare` first"):
+        command.main(command.Prepare(root, "tiny", splits=("testing",)))
+    before = prepare_cache(root, folder, "tiny", splits=("train",), any_size=True)
+    with pytest.raises(ValueError, match=r"the splits train, not 'val': run `prepare --add"):
+        before.read("val")
+    command.main(command.Prepare(root, "tiny", splits=("val",), add=True, any_size=True))
+    result = command.main(command.Prepare(root, "tiny", splits=("testing",), any_size=True))
+    assert result["frames_testing"] == 2 and result["frames_train"] == 3
+    assert result["plane_fitted"] == 2 and result["missing"] == 1
+    cache = open_cache(folder)
+    assert cache.sizes == before.sizes
+    assert cache.splits["testing"] == ("000000", "000004")
+    # Two frames are called 000000.
+    train, testing = cache.read("train")[0], cache.read("testing")[0]
+    assert train.truth_mask.sum() == 1 and not testing.truth_mask.any()
+    assert not np.array_equal(train.image, testing.image)
+    assert abs(testing.plane[3] - 1.6) < 0.05
+    with pytest.raises(ValueError, match="the splits train, val, testing: cannot add val"):
+        prepare_cache(root, folder, "tiny", splits=("val",), add=True)
+    with pytest.raises(ValueError, match="split 'testing' has no labels to train on"):
+        command.main(command.Train(root, preset="tiny", split="testing"))
+    # The benchmark's list of test frames is not a list of labelled ones.
+    (lists / "test.txt").write_text("000000\n000003\n")
+    with pytest.raises(ValueError, match=r"1 frames of ImageSets/test\.txt are in train\.txt too"):
+        split_frames(root, ("test",))
+
+
 @pytest.mark.parametrize(
     ("damage", "message"),
     [
@@ -148,3 +193,31 @@ def test_study_trains_and_evaluates_both_models(
     study_detector.main(options)
     assert (run / "result.json").read_text() == before
     assert "result: evaluations=0" in capsys.readouterr().out.splitlines()[-1]
+    result = json.loads((run / "eval_clean" / "result.json").read_text())
+    for name in ("3d", "bev"):
+        tight, loose = (result[f"{name}_moderate_r40{end}"] for end in ("", "_iou50"))
+        assert tight <= loose
+    assert "2d_moderate_r40_iou50" not in result and result["split"] == "val"
+
+    # The same runs on test frames go beside them, into a table of their own.
+    write_frame(root, "000004", 4)
+    (root / "ImageSets" / "test.txt").write_text("000004\n")
+    held = (run / "eval_clean" / "result.json").read_text()
+    study_detector.main(dataclasses.replace(options, split="test", kinds=("lidar_loss",)))
+    assert "result: evaluations=4" in capsys.readouterr().out.splitlines()[-1]
+    assert (run / "eval_clean" / "result.json").read_text() == held
+    assert (run / "eval_test_lidar_loss" / "data" / "000004.txt").exists()
+    table = json.loads((tmp_path / "results" / "study_detector_test.json").read_text())
+    assert table["table"] == "study_detector_test" and table["title"].endswith("test frames")
+    kinds = {(row["row"], row["split"]) for row in table["rows"]}
+    assert {("clean", "test"), ("mean of failures", "test"), ("training", "train")} <= kinds
+
+    # Frames without labels: result files and no score.
+    move_to_testing(root, "000003")
+    command.main(command.Prepare(root, "tiny", splits=("testing",), any_size=True))
+    found = command.main(command.Eval(root, preset="tiny", split="testing", run=run, pictures=1))
+    assert len(read_results(run / "eval_testing" / "data" / "000003.txt").score) > 0
+    assert not any(key.startswith(("3d", "bev", "cars")) for key in found)
+    assert (run / "eval_testing" / "000003_image.png").exists()
+    last = capsys.readouterr().out.splitlines()[-1]
+    assert last.startswith("result: config=avod_argate split=testing frames=1 detections=")

@@ -21,7 +21,7 @@ from fusion.detection.io import (
 )
 from fusion.detection.objects import Objects
 from fusion.detection.settings import CAR_SIZES
-from scripts import study_detector
+from scripts import study_detector, study_geometry
 from scripts import train_detector as command
 
 
@@ -165,6 +165,25 @@ def test_missing_steps_are_named(root: Path) -> None:
         command.main(command.Eval(root, preset="tiny", failure="camera_theft"))
     with pytest.raises(ValueError, match="failure 'rain', expected of camera_noise"):
         study_detector.evaluations(study_detector.Config(root, kinds=("rain",)))
+
+
+def test_geometry_is_recorded(
+    root: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(ValueError, match="expected --real or --simulated"):
+        study_geometry.main(study_geometry.Config(results=tmp_path))
+    with pytest.raises(ValueError, match="96x32 pixels, expected 1224x370"):
+        study_geometry.main(study_geometry.Config(real=root, results=tmp_path))
+    study_geometry.main(study_geometry.Config(simulated=root, frames=3, results=tmp_path))
+    assert capsys.readouterr().out.splitlines()[-1] == "result: simulated=3 rows=15"
+    table = json.loads((tmp_path / "study_kitti_geometry.json").read_text())
+    values = {row["row"]: row["mean"] for row in table["rows"]}
+    assert values["labelled cars"] == 3 and "git" in table
+    # The made labels name one and the same image box, wherever the car is.
+    share = values["lidar points in a car's 3D box that project into its image box"]
+    assert 5 < share < 95
+    assert values["fitted against given plane, height, largest"] < 0.02
+    assert values["height of a car's bottom above the fitted plane, mean size"] < 0.02
 
 
 @pytest.mark.slow

@@ -226,8 +226,11 @@ def failures(plan: Plan, tables: Sequence[str]) -> Done:
             rows = json.loads(held.read_text(encoding="utf-8")) if held.exists() else []
         else:
             names = QUICK_METHODS if quick else tuple(METHODS)
+            methods = tuple(filter(plan.wants, names))
+            if not methods:  # which the study would read as all of them
+                continue
             config = study_failures.Config(
-                circuit=circuit, out=out, methods=tuple(filter(plan.wants, names)),
+                circuit=circuit, out=out, methods=methods,
                 seeds=plan.seeds or (2 if quick else 20),
             )  # fmt: skip
             if quick:

@@ -284,6 +284,12 @@ def test_collecting_from_single_runs(tmp_path: Path) -> None:
 
 
 @pytest.mark.relaxed  # the optimizer's own promotions
+def test_models_of_other_chapters_start_no_search(tmp_path: Path) -> None:
+    plan = _chapters.Plan(preset="quick", results=tmp_path, out=tmp_path, models=("S4", "baseline"))
+    assert _chapters.failures(plan, ("4.1", "4.2")) == ({}, 0)
+    assert not any(tmp_path.iterdir())
+
+
 def test_without_har_the_quick_piece_says_that_it_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

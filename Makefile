@@ -8,7 +8,7 @@ JOBS   ?= 2
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
 
-.PHONY: help demo report test slow lint types docs wheel check clean
+.PHONY: help demo report test slow commands lint types docs wheel check clean
 .DEFAULT_GOAL := help
 
 help:  ## list the commands
@@ -40,6 +40,9 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 slow: $(VENV)/.dev  ## the tests that take minutes each
 	$(BIN)/python -m pytest -m slow
 
+commands: $(VENV)/.dev  ## run every command of README and docs at its smallest size, in a copy
+	$(BIN)/python scripts/check_commands.py --jobs $(JOBS)
+
 lint: $(VENV)/.dev  ## ruff: style and errors
 	$(BIN)/ruff check .
 	$(BIN)/ruff format --check .
@@ -53,7 +56,7 @@ docs: $(VENV)/.dev  ## build the documentation into site/
 wheel: $(VENV)/.dev  ## build the wheel and import it from outside the repository
 	$(BIN)/python scripts/check_wheel.py
 
-check: lint types docs test  ## everything that CI runs
+check: lint types docs wheel test commands  ## everything that CI runs
 
 clean:  ## remove what the other commands made, but not runs/ or results/
 	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,5 +1,7 @@
 """The documentation holds: its examples run, its links lead somewhere, its commands parse.
 
+That the commands run, too, is what scripts/check_commands.py is for.
+
 A Python block of a tutorial is executed, after those before it on the page. An HTML comment
 `<!-- not run here: why -->` on the line before a block takes it out, where it would take minutes.
 """
@@ -11,8 +13,6 @@ import importlib
 import inspect
 import re
 import shlex
-import subprocess
-import sys
 import typing
 import unicodedata
 from pathlib import Path
@@ -22,9 +22,8 @@ import pytest
 import tyro
 
 from scripts import render_api
+from scripts._commands import PAGES, ROOT, commands, page_name, script_commands
 
-ROOT = Path(__file__).resolve().parent.parent
-PAGES = [ROOT / "README.md", *sorted((ROOT / "docs").rglob("*.md"))]
 TUTORIALS = [p for p in PAGES if p.parent.name == "tutorials" and p.name != "index.md"]
 BLOCK = re.compile(r"(<!-- not run here: [^\n]+ -->\n)?```python\n(.*?)```", re.DOTALL)
 FENCE = re.compile(r"^```.*?^```", re.DOTALL | re.MULTILINE)
@@ -37,10 +36,6 @@ def blocks(page: Path) -> list[tuple[bool, str, int]]:
         (m.group(1) is None, m.group(2), text[: m.start(2)].count("\n"))
         for m in BLOCK.finditer(text)
     ]
-
-
-def page_name(page: Path) -> str:
-    return str(page.relative_to(ROOT))
 
 
 def with_marks(page: Path) -> Any:
@@ -131,32 +126,7 @@ def test_a_broken_link_is_found() -> None:
     assert broken_links(page, text) == ["argate.md#nowhere", "images/none.png"]
 
 
-def commands(text: str) -> list[str]:
-    """Commands of ours: lines of fenced or indented blocks, and whole ones in backticks."""
-    text = re.sub(r"\\\n\s*", " ", text)
-    lines = re.findall(
-        r"^(?:\s*\$ |\s*)((?:taskset -c \d+ )?python scripts/\S+\.py.*)$", text, re.M
-    )
-    inline = re.findall(r"`((?:taskset -c \d+ )?python\s+scripts/\w+\.py[^`]*)`", text)
-    found = [" ".join(c.split()) for c in [*(x for x in lines if "`" not in x), *inline]]
-    # Brackets hold options that may be left out; three dots, options that are explained beside.
-    found = [re.sub(r"\[(--[^\]]*)\]", r"\1", c) for c in found]
-    return [c for c in found if not re.search(r"\.\.\.(?=\s|$)", c)]
-
-
-def documented() -> list[tuple[str, str]]:
-    """(where, command), each command once."""
-    found: dict[str, str] = {}
-    texts = {page_name(page): page.read_text(encoding="utf-8") for page in PAGES}
-    for path in sorted((ROOT / "scripts").glob("*.py")):
-        texts[page_name(path)] = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
-    for where, text in texts.items():
-        for command in commands(text):
-            found.setdefault(command, where)
-    return [(where, command) for command, where in found.items()]
-
-
-COMMANDS = documented()
+COMMANDS = script_commands()
 
 
 def test_commands_are_found() -> None:
@@ -197,31 +167,3 @@ def test_commands_parse(script: str, capsys: pytest.CaptureFixture[str]) -> None
             pytest.fail(f"{where}: `{command}` does not parse: {message.out}{message.err}")
         except ValueError as error:
             pytest.fail(f"{where}: `{command}` is refused: {error}")
-
-
-# Commands of the documentation that take a minute or less; each is run as it stands.
-QUICK = (
-    "python scripts/train_argate.py --dataset simulated --model baseline",
-    "python scripts/sweep.py --study lif --grid drive=16:40:13 neuron.tau_m=10,20,40 --seeds 8 "
-    "--out runs/sweep_lif",
-    "python scripts/simulate_kitti.py --frames 4 --val 1 --test 0 --seed 3 "
-    "--out runs/kitti_picture --picture docs/images/kitti_simulated.png",
-    "python scripts/train_snn.py --scenario 1 --network S4 --preset quick",
-)
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("command", QUICK, ids=lambda c: Path(c.split()[1]).stem)
-def test_quick_command_runs(command: str, tmp_path: Path) -> None:
-    known = [shlex.split(c, comments=True) for _, c in COMMANDS]
-    assert shlex.split(command) in known, "this command is not in the documentation any more"
-    words = shlex.split(command)[1:]
-    done = subprocess.run(
-        [sys.executable, str(ROOT / words[0]), *words[1:]],
-        cwd=tmp_path,
-        capture_output=True,
-        text=True,
-        check=False,
-    )
-    assert done.returncode == 0, done.stderr[-2000:]
-    assert done.stdout.strip().splitlines()[-1].startswith("result:")

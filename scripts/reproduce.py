@@ -82,7 +82,10 @@ def _tables(config: Config) -> tuple[str, ...]:
 
 
 def _fill(config: Config, out: Path | None, results: Path) -> tuple[dict[str, Any], Any, int]:
-    """Run the chapters; returns rows and wall seconds by table, and the number of runs."""
+    """Run the chapters; returns rows and times by table, and the number of runs.
+
+    The times are `{"seconds": {tables: wall}, "cpu_seconds": {tables: CPU of this process}}`.
+    """
     quick = config.preset == "quick"
     plan = _chapters.Plan(
         preset=config.preset,
@@ -102,14 +105,16 @@ def _fill(config: Config, out: Path | None, results: Path) -> tuple[dict[str, An
         by_runner.setdefault(_chapters.RUNNERS[table], []).append(table)
     written: dict[str, Any] = {}
     seconds: dict[str, float] = {}
+    cpu_seconds: dict[str, float] = {}
     runs = 0
     for runner, tables in by_runner.items():
-        started = time.monotonic()
+        started, used = time.monotonic(), time.process_time()
         found, count = runner(plan, tables)
         written |= found
         runs += count
         seconds[", ".join(tables)] = round(time.monotonic() - started, 1)
-    return written, seconds, runs
+        cpu_seconds[", ".join(tables)] = round(time.process_time() - used, 1)
+    return written, {"seconds": seconds, "cpu_seconds": cpu_seconds}, runs
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -126,9 +131,9 @@ def main(config: Config) -> dict[str, Any]:
     written: dict[str, Any] = {}
     runs = 0
     if not config.report_only:
-        written, seconds, runs = _fill(config, out, results)
+        written, times, runs = _fill(config, out, results)
         if quick and out is not None and not config.collect_only:
-            _run.write_json(out / "report.json", {"seconds": seconds} | _run.provenance())
+            _run.write_json(out / "report.json", times | _run.provenance())
     fresh = results if results != _run.RESULTS else Path("runs") / "report" / "results"
     report = config.report or (config.out / "report" if config.out else Path("report"))
     page = _report.write(report, fresh=fresh, record=_run.RESULTS)

@@ -290,6 +290,14 @@ def test_models_of_other_chapters_start_no_search(tmp_path: Path) -> None:
     assert not any(tmp_path.iterdir())
 
 
+def test_times_of_the_tables_are_kept(tmp_path: Path) -> None:
+    config = reproduce.Config(table=("4.1",), preset="quick", models=("S4",), out=tmp_path)
+    assert reproduce.main(config) == {}
+    times = json.loads((tmp_path / "report.json").read_text(encoding="utf-8"))
+    for kind in ("seconds", "cpu_seconds"):
+        assert set(times[kind]) == {"4.1"} and times[kind]["4.1"] >= 0.0
+
+
 def test_without_har_the_quick_piece_says_that_it_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

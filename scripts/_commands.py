@@ -59,7 +59,7 @@ RULES = (
     Rule("pytest", not_run="is part of the test suite"),
     # Chapter 2.
     Rule("train_snn.py", f"{_ROBOT} --preset quick --overwrite"),
-    Rule("study_transfer.py", f"{_ROBOT} --maps 1 --test-trials 1 --scenarios 1"),
+    Rule("study_transfer.py", f"{_ROBOT} --maps 1 --test-trials 1 --scenarios 1 --checkpoints 20"),
     Rule("study_snn.py gamma", f"{_ROBOT} --test-trials 1", forget="results/study_snn_gamma.json"),
     Rule(
         "study_snn.py readings",

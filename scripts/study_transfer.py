@@ -44,6 +44,8 @@ class Transfer:
     """Unseen maps."""
     test_trials: int = 20
     """Per checkpoint of `trials`."""
+    checkpoints: tuple[int, ...] = CHECKPOINTS
+    """Numbers of learning trials of `trials`; 20 is the source's."""
     max_steps: int = 200
     block: int = 8
     record: bool = True
@@ -125,7 +127,7 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
     keys = seed_keys(jnp.arange(config.seeds))
     values: dict[str, list[float]] = {}
     columns = []
-    for n in CHECKPOINTS:
+    for n in config.checkpoints:
         # Trial i depends on the key and i alone: every run repeats the shorter ones.
         run = jax.jit(
             lambda keys, params, n=n: trials.run_experiment(
@@ -137,6 +139,8 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
         column = (np.asarray(run(keys, params)) == trials.ARRIVED).mean(axis=1)
         columns.append(column)
         values[f"sr_testing_after_{n}"] = (100.0 * column).tolist()
+    if config.checkpoints != CHECKPOINTS:
+        return values  # the first number that suffices is known among all of them only
     reached = np.stack(columns) >= 0.9
     first = [float(CHECKPOINTS[r.argmax()]) for r in reached.T if r.any()]
     values["trials_to_90"] = first
@@ -147,10 +151,19 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
 UNITS = {"path_ratio": "1", "trials_to_90": "trials"}
 
 
+def shown_metric(config: Transfer) -> str:
+    """The score that the progress bar and the last line show."""
+    if config.study == "maps":
+        return "sr_unseen"
+    return f"sr_testing_after_{20 if 20 in config.checkpoints else config.checkpoints[-1]}"
+
+
 def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
     """Run the study on every scenario; returns the values by scenario."""
     if config.seeds < 1 or config.maps < 1:
         raise ValueError(f"seeds = {config.seeds}, maps = {config.maps}: expected at least 1")
+    if not config.checkpoints or list(config.checkpoints) != sorted({*config.checkpoints} - {0}):
+        raise ValueError(f"checkpoints = {config.checkpoints}: expected rising numbers from 1 on")
     _run.enable_compilation_cache()
     run = study_maps if config.study == "maps" else study_trials
     found: dict[Any, Any] = {}
@@ -159,7 +172,7 @@ def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
         for scenario in config.scenarios:
             values = run(config, scenario)
             found[scenario] = values
-            name = "sr_unseen" if config.study == "maps" else "sr_testing_after_20"
+            name = shown_metric(config)
             mean = sum(values[name]) / len(values[name])
             bar.update(task, advance=1, status=f"Scenario {scenario}: {mean:.0f} %")
             if not config.record:
@@ -189,7 +202,7 @@ def run_cli() -> None:
         found = main(config)
     except ValueError as error:
         _run.fail(str(error))
-    name = "sr_unseen" if config.study == "maps" else "sr_testing_after_20"
+    name = shown_metric(config)
     rates = {f"scenario{s}": sum(v[name]) / len(v[name]) for s, v in found.items()}
     _run.print_result(study=config.study, metric=name, **rates)
 

@@ -11,9 +11,22 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from fusion.detection.convolution import convolve
+
 __all__ = ["FeaturePyramid", "TransposedConv"]
 
 GROUP_SIZE = 4  # channels normalized together by group norm
+
+
+class _Conv(nn.Module):
+    """3x3 convolution without bias, zeros around the map."""
+
+    features: int
+
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        shape = (3, 3, x.shape[-1], self.features)
+        return convolve(x, self.param("kernel", nn.initializers.he_normal(), shape))
 
 
 class TransposedConv(nn.Module):
@@ -57,7 +70,7 @@ class _Block(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, train: bool) -> Array:
-        x = nn.Conv(self.features, (3, 3), use_bias=False, name="conv")(x)
+        x = _Conv(self.features, name="conv")(x)
         return nn.relu(_normalize(self.norm, train)(x))
 
 

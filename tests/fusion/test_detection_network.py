@@ -14,6 +14,7 @@ import pytest
 
 from fusion.detection import fitting
 from fusion.detection.calibration import Calibration
+from fusion.detection.convolution import convolve
 from fusion.detection.detect import to_objects
 from fusion.detection.detection_loss import class_loss, regression_loss
 from fusion.detection.detector import count_main_parameters, fuse, init_detector
@@ -111,6 +112,31 @@ def test_mirrored_frames_keep_their_projection(example: Example) -> None:
     np.testing.assert_allclose(after[:, [0, 2]], before[:, [0, 2]], atol=1e-4)
     np.testing.assert_allclose(after[:, [1, 3]], 1 - before[:, [3, 1]], atol=1e-4)
     np.testing.assert_allclose(moved @ new_plane[:3], points @ plane[:3], rtol=1e-5)
+
+
+@pytest.mark.parametrize(
+    ("height", "width", "c", "f"), [(4, 6, 3, 8), (5, 6, 2, 4), (4, 6, 4, 16), (3, 5, 4, 4)]
+)
+def test_convolution_in_blocks_equals_the_plain_one(
+    height: int, width: int, c: int, f: int
+) -> None:
+    def plain(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        return jax.lax.conv_general_dilated(
+            x, kernel, (1, 1), "SAME", dimension_numbers=("NHWC", "HWIO", "NHWC")
+        )
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    x = jax.random.normal(keys[0], (2, height, width, c))
+    kernel = jax.random.normal(keys[1], (3, 3, c, f))
+    g = jax.random.normal(keys[2], (2, height, width, f))
+    for ours, theirs in zip(
+        *(
+            jax.jit(lambda x, k, g, run=run: (run(x, k), *jax.vjp(run, x, k)[1](g)))(x, kernel, g)
+            for run in (convolve, plain)
+        ),
+        strict=True,
+    ):
+        np.testing.assert_allclose(ours, theirs, atol=2e-5)
 
 
 def test_transposed_convolution_equals_the_dilated_one() -> None:

@@ -81,10 +81,10 @@ class DetectorConfig:
     angle_weight: float = 1.0
     gate_loss: LossConfig = dataclasses.field(default_factory=lambda: LossConfig(uniform_floor=1.0))
     gate_params: LossParams = dataclasses.field(
-        default_factory=lambda: LossParams(alpha=1.0, beta=1.0, tau=2.0, anchor=0.3)
+        default_factory=lambda: LossParams(alpha=1.0, beta=1.0, tau=0.1, anchor=0.3)
     )
     targets: TargetConfig = dataclasses.field(
-        default_factory=lambda: TargetConfig(loss_range=(0.0, 6.0))
+        default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0))
     )
 
     def __post_init__(self) -> None:

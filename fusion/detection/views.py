@@ -12,10 +12,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fusion.detection.convolution import convolve
+from fusion.detection.group_norm import group_norm_relu
 
 __all__ = ["FeaturePyramid", "TransposedConv"]
-
-GROUP_SIZE = 4  # channels normalized together by group norm
 
 
 class _Conv(nn.Module):
@@ -71,13 +70,22 @@ class _Block(nn.Module):
     @nn.compact
     def __call__(self, x: Array, train: bool) -> Array:
         x = _Conv(self.features, name="conv")(x)
-        return nn.relu(_normalize(self.norm, train)(x))
+        return _normalize_relu(self.norm, x, train)
 
 
-def _normalize(norm: str, train: bool) -> nn.Module:
+class _GroupNormRelu(nn.Module):
+    @nn.compact
+    def __call__(self, x: Array) -> Array:
+        scale = self.param("scale", nn.initializers.ones, (x.shape[-1],))
+        return group_norm_relu(x, scale, self.param("bias", nn.initializers.zeros, x.shape[-1:]))
+
+
+def _normalize_relu(norm: str, x: Array, train: bool) -> Array:
+    """Inside a compact method: normalization of this kind, called `norm`, and ReLU."""
     if norm == "batch":
-        return nn.BatchNorm(use_running_average=not train, momentum=0.99, name="norm")
-    return nn.GroupNorm(num_groups=None, group_size=GROUP_SIZE, epsilon=1e-3, name="norm")
+        layer = nn.BatchNorm(use_running_average=not train, momentum=0.99, name="norm")
+        return nn.relu(layer(x))
+    return _GroupNormRelu(name="norm")(x)
 
 
 def _halve(x: Array, axis: int) -> Array:
@@ -119,7 +127,7 @@ class FeaturePyramid(nn.Module):
                 x = _Block(features, self.norm, name=f"encoder{level}_{i}")(x, train)
         for level in reversed(range(len(skips))):
             up = TransposedConv(self.widths[level], name=f"up{level}")(x)
-            up = nn.relu(_UpNorm(self.norm, name=f"up_norm{level}")(up, train))
+            up = _UpNorm(self.norm, name=f"up_norm{level}")(up, train)
             joined = jnp.concatenate([up, skips[level]], axis=-1)
             mixed = self.widths[max(level - 1, 0)]
             x = _Block(mixed, self.norm, name=f"decoder{level}")(joined, train)
@@ -131,4 +139,4 @@ class _UpNorm(nn.Module):
 
     @nn.compact
     def __call__(self, x: Array, train: bool) -> Array:
-        return _normalize(self.norm, train)(x)
+        return _normalize_relu(self.norm, x, train)

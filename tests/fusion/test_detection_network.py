@@ -7,6 +7,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -21,6 +22,7 @@ from fusion.detection.detector import count_main_parameters, fuse, init_detector
 from fusion.detection.encodings import box3d_to_box4c, box_corners, project_boxes
 from fusion.detection.examples import Example, flip, make_example, make_inputs, stack_examples
 from fusion.detection.fitting import fit_detector, frame_order, run_detector
+from fusion.detection.group_norm import GROUP_SIZE, group_norm_relu
 from fusion.detection.io import Frame
 from fusion.detection.objects import Objects
 from fusion.detection.proposals import Detections, anchor_boxes, decode_second, final_boxes
@@ -137,6 +139,24 @@ def test_convolution_in_blocks_equals_the_plain_one(
         strict=True,
     ):
         np.testing.assert_allclose(ours, theirs, atol=2e-5)
+
+
+def test_group_norm_equals_the_library_and_its_gradient() -> None:
+    layer: Any = nn.GroupNorm(num_groups=None, group_size=GROUP_SIZE, epsilon=1e-3)
+
+    def theirs(x: jax.Array, scale: jax.Array, bias: jax.Array) -> jax.Array:
+        return nn.relu(layer.apply({"params": {"scale": scale, "bias": bias}}, x))
+
+    keys = jax.random.split(jax.random.key(0), 4)
+    x = 0.5 + 2.0 * jax.random.normal(keys[0], (2, 5, 6, 8))
+    scale, bias = 1.0 + 0.3 * jax.random.normal(keys[1], (8,)), jax.random.normal(keys[2], (8,))
+    g = jax.random.normal(keys[3], x.shape)
+    (ours, our_vjp), (expected, their_vjp) = (
+        jax.vjp(run, x, scale, bias) for run in (group_norm_relu, theirs)
+    )
+    np.testing.assert_allclose(ours, expected, atol=1e-5)
+    for got, wanted in zip(our_vjp(g), their_vjp(g), strict=True):
+        np.testing.assert_allclose(got, wanted, atol=3e-5)
 
 
 def test_transposed_convolution_equals_the_dilated_one() -> None:

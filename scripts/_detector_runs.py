@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import json
 from pathlib import Path
 from typing import Any, Literal
+
+from scripts import _run
 
 Model = Literal["avod", "avod_argate"]
 PresetName = Literal["paper", "small", "tiny"]
@@ -155,11 +158,43 @@ def run_config(folder: Path, config: Eval) -> Train:
     Raises:
         FileNotFoundError: there is no run.
     """
-    import json
-
     path = folder / "config.json"
     if not path.is_file():
         raise FileNotFoundError(f"{folder} holds no run: run `train` first")
     held = json.loads(path.read_text(encoding="utf-8"))["settings"]
     held["failure_kinds"] = tuple(held["failure_kinds"])
     return Train(data=config.data, cache=config.cache, **held)
+
+
+def resolved(detector: Any, training: Any) -> dict[str, Any]:
+    """All settings of a training as JSON values, those of the presets too."""
+    parts = {"detector": dataclasses.asdict(detector), "training": dataclasses.asdict(training)}
+    for name in ("gate_params", "gate_loss"):
+        value = parts["detector"][name]
+        parts["detector"][name] = value._asdict() if hasattr(value, "_asdict") else value
+    held: dict[str, Any] = _run.to_jsonable(parts)
+    return held
+
+
+def check_settings(folder: Path, detector: Any, training: Any) -> None:
+    """Refuse a finished run whose settings are not those of this command line and these presets.
+
+    Runs are kept and taken up again, while the presets' numbers live in the code: a run from before
+    a change would be mixed with later ones. Runs that did not write their settings pass.
+
+    Raises:
+        ValueError: a setting differs; the message names it.
+    """
+    path = folder / "result.json"
+    if not path.is_file():
+        return
+    held = json.loads(path.read_text(encoding="utf-8")).get("settings", {})
+    for part, now in resolved(detector, training).items():
+        before = held.get(part, {})
+        # A setting that is new since then has its default, which changes nothing.
+        for key in sorted(now.keys() & before.keys()):
+            if now[key] != before[key]:
+                raise ValueError(
+                    f"{folder} was trained with {key}={before[key]}, not {now[key]}: give the "
+                    "settings of the run, or train in another folder (--name, --out)"
+                )

@@ -136,26 +136,30 @@ def _prepare(config: Config) -> None:
 
 def execute(config: Config) -> int:
     """Do what is missing; returns the number of evaluations done."""
+    from fusion.detection.cache import open_cache
     from scripts import train_detector as command
 
     _prepare(config)
     split, done = _split(config), 0
+    checked: set[Path] = set()
     for model, seed, failure in evaluations(config):
         record, run = _record(config, model, seed, failure), _run_path(config, model, seed)
+        options = command.Train(
+            config.data, model, config.preset, config.cache, seed=seed, steps=config.steps,  # type: ignore[arg-type]
+            failures=config.failures and not config.real, tau=config.tau, alpha=config.alpha,
+            beta=config.beta, normalizer=config.normalizer, path_drop=config.path_drop,
+            truth_proposals=config.truth_proposals, learning_rate=config.learning_rate, out=run,
+            resume=(run / "config.json").exists(),
+        )  # fmt: skip
+        if run not in checked:
+            cache = open_cache(command.cache_folder(options))
+            command.check_settings(run, *command.build(options, cache))
+            checked.add(run)
         if record.exists():
             continue
         if not (run / "result.json").exists():
             print(f"train {model} seed {seed}", flush=True)
-            command.train(
-                command.Train(
-                    config.data, model, config.preset, config.cache, seed=seed, steps=config.steps,  # type: ignore[arg-type]
-                    failures=config.failures and not config.real, tau=config.tau,
-                    alpha=config.alpha, beta=config.beta, normalizer=config.normalizer,
-                    path_drop=config.path_drop, truth_proposals=config.truth_proposals,
-                    learning_rate=config.learning_rate, out=run,
-                    resume=(run / "config.json").exists(),
-                )
-            )  # fmt: skip
+            command.train(options)
         result = command.evaluate(
             command.Eval(
                 config.data, model, config.preset, config.cache, split=split, seed=seed, run=run,  # type: ignore[arg-type]

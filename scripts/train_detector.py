@@ -33,7 +33,9 @@ from scripts._detector_runs import (
     Train,
     build,
     cache_folder,
+    check_settings,
     load_run,
+    resolved,
     run_config,
     run_folder,
 )
@@ -130,7 +132,8 @@ def train(config: Train) -> dict[str, Any]:
         "loss": last["total"],
         "weight_camera": last["weight_camera"],
     }
-    _run.write_json(out / "result.json", result | {"provenance": _run.provenance()})
+    extra = {"settings": resolved(detector, training), "provenance": _run.provenance()}
+    _run.write_json(out / "result.json", result | extra)
     return result
 
 
@@ -152,7 +155,10 @@ def evaluate(config: Eval) -> dict[str, Any]:
         )
     folder = config.run or run_folder(config)
     cache = open_cache(cache_folder(config))
-    detector, training = build(run_config(folder, config), cache)
+    trained = run_config(folder, config)
+    config = dataclasses.replace(config, config=trained.config)
+    detector, training = build(trained, cache)
+    check_settings(folder, detector, training)
     state = load_run(folder, detector, training)
     names, examples = cache.names(config.split), cache.read(config.split)
     failing = f"_{config.failure}" if config.failure else ""

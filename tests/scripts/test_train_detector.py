@@ -186,6 +186,24 @@ def test_geometry_is_recorded(
     assert values["height of a car's bottom above the fitted plane, mean size"] < 0.02
 
 
+def test_runs_of_other_settings_are_not_mixed(root: Path, tmp_path: Path) -> None:
+    cache = prepare_cache(root, root / "cache_tiny", "tiny", splits=("train",), any_size=True)
+    options = command.Train(root, preset="tiny", steps=4)
+    detector, training = command.build(options, cache)
+    held = {"settings": command.resolved(detector, training)}
+    (tmp_path / "result.json").write_text(json.dumps(held))
+    command.check_settings(tmp_path, detector, training)
+    for changed, name in (
+        (dataclasses.replace(options, steps=5), "steps=4, not 5"),
+        (dataclasses.replace(options, tau=0.7), "gate_params="),
+        (dataclasses.replace(options, path_drop=0.3), "path_drop="),
+    ):
+        with pytest.raises(ValueError, match=f"was trained with {name}"):
+            command.check_settings(tmp_path, *command.build(changed, cache))
+    (tmp_path / "result.json").write_text("{}")  # from before settings were written
+    command.check_settings(tmp_path, detector, training)
+
+
 @pytest.mark.slow
 @pytest.mark.relaxed
 def test_study_trains_and_evaluates_both_models(

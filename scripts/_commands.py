@@ -108,7 +108,7 @@ RULES = (
         "--parts ldo_ngspice ldo_grid box --ldo-samples 8 --grid-samples 2 --box-samples 8",
         needs="ngspice",
     ),
-    Rule("study_rare_events.py", "--runs 1 --n-importance 50 --n-subset 50 --replicates 2"),
+    Rule("study_rare_events.py", "--runs 1 --n-importance 50 --n-subset 100 --replicates 3"),
     Rule("bench_circuits.py", "--batch 2 --repeats 1 --ngspice-samples 2", needs="ngspice"),
     Rule("bench_revnet.py", "--dim 6 --samples 16 --depths 1 2"),
     # All chapters.
@@ -139,6 +139,9 @@ RULES = (
         "sweep.py --shard",
         "--study lif --grid drive=16,40 --seeds 1 --out runs/sweep_shard --chunk-size 1",
     ),
+    Rule("sweep.py failure", "--seeds 1 --options n_init=4 n_total=6 candidates=8 refit_every=2"),
+    Rule("sweep.py argate", "--seeds 1 --options epochs=1 model=baseline"),
+    Rule("sweep.py snn", "--seeds 1 --options max_steps=2 n_learn=1 n_test=2 --chunk-size 1"),
     Rule("bench_sweep.py", "--repeats 2 --writers 1 --workers 1 --steps 100"),
     Rule("python -c"),
 )

@@ -198,7 +198,10 @@ def _gram_of_lower(linv: Array) -> Array:
 
 def _inverse_factor(covariance: Array) -> tuple[Array, Array]:
     """Inverse Cholesky factor and log determinant."""
-    factor = jnp.linalg.cholesky(covariance)
+    # The matrix is symmetric: to symmetrise it again, or to turn it into LAPACK's column order,
+    # takes strided passes over it that cost as much as the factorisation. Its transpose is in
+    # that order already.
+    factor = jax.lax.linalg.cholesky(covariance.T, symmetrize_input=False)
     return _invert_lower(factor), 2.0 * jnp.sum(jnp.log(jnp.diagonal(factor)))
 
 

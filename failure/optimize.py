@@ -62,7 +62,11 @@ def project(domain: Domain, x: Float[Array, " d"]) -> Float[Array, " d"]:
     x = jnp.clip(x, domain.lower, domain.upper)
     # The floor keeps the derivative of the root finite at the origin.
     norm = jnp.sqrt(jnp.maximum(x @ x, 1e-30))
-    return x * jnp.minimum(jnp.ones_like(norm), domain.radius / norm)
+    # An infinite radius must not be divided: the slope of the branch not taken would be 0 inf.
+    bounded = jnp.isfinite(domain.radius)
+    radius = jnp.where(bounded, domain.radius, jnp.ones_like(domain.radius))
+    shrink = jnp.minimum(jnp.ones_like(norm), radius / norm)
+    return x * jnp.where(bounded, shrink, jnp.ones_like(norm))
 
 
 def sample(domain: Domain, key: Key[Array, ""], n: int) -> Float[Array, "n d"]:

@@ -16,7 +16,7 @@ from tests._api import Case, check
 N, D = 6, 2
 GP = gp.GPConfig()
 BNN = bnn.BNNConfig(hidden=3)
-TASK = embeddings.Task("ball", 3.0, 4)
+TASK = embeddings.Task("box", 3.0, 4)
 LDO_LIKE = {"polarity": 1.0, "mobility": 0.05, "early": 4e6, "overlap": 3e-10}
 
 

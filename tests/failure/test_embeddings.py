@@ -45,6 +45,19 @@ def test_random_embedding_is_the_clipped_linear_map():
         embeddings.random_embedding(jax.random.key(0), BOX, 7)
 
 
+@pytest.mark.parametrize("task", [BOX, BALL])
+def test_slope_of_decode_agrees_with_differences(task):
+    space = embeddings.random_embedding(jax.random.key(0), task, 2)
+    domain = embeddings.task_domain(task)
+    # the first point clips some coordinates of the box, and leaves the ball
+    for u in (jnp.asarray([0.31, -0.24]), jnp.asarray([0.02, -0.03])):
+        decode = jax.jit(lambda u: embeddings.decode(space, domain, u)[0])
+        slope = jax.jacrev(decode)(u)
+        step = 1e-6 * jnp.eye(2)
+        differences = [(decode(u + h) - decode(u - h)) / 2e-6 for h in step]
+        np.testing.assert_allclose(slope, jnp.stack(differences, 1), rtol=1e-6, atol=1e-6)
+
+
 def reversed_space(order, n_active):
     network = revnet.init(jax.random.key(1), 6, depth=3, scale=1.0, dtype=jnp.float64)
     return embeddings.ReversedFeatures(

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 
 import jax.numpy as jnp
 import numpy as np
@@ -15,7 +15,7 @@ from fusion.detection.evaluate import DIFFICULTIES, METRICS, N_POINTS, Evaluatio
 from fusion.detection.io import Frame
 from fusion.detection.objects import Objects, select
 
-__all__ = ["plot_bird", "plot_image", "plot_precision", "plot_training"]
+__all__ = ["plot_bird", "plot_detections", "plot_image", "plot_precision", "plot_training"]
 
 TRUTH, FOUND = "#009e73", "#e69f00"
 # The four edges of the bottom, of the top, and between them.
@@ -39,16 +39,13 @@ def _draw_ground(axes: Axes, objects: Objects, colour: str, label: str) -> None:
         axes.plot(*ground[:2].T, color=colour, lw=2.6)  # the front
 
 
-def plot_bird(
+def _draw_bird(
+    axes: Axes,
     frame: Frame,
     detections: Objects,
-    *,
-    x_range: tuple[float, float] = (-25.0, 25.0),
-    z_range: tuple[float, float] = (0.0, 50.0),
-) -> Figure:
-    """Lidar points from above with labelled cars and detections; thick edges are fronts."""
-    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
-    axes = figure.subplots()
+    x_range: tuple[float, float],
+    z_range: tuple[float, float],
+) -> None:
     points = lidar_to_camera(frame.calibration, frame.points[:, :3])
     inside = (points[:, 0] > x_range[0]) & (points[:, 0] < x_range[1])
     inside &= (points[:, 2] > z_range[0]) & (points[:, 2] < z_range[1])
@@ -61,14 +58,10 @@ def plot_bird(
     axes.set_title(f"frame {frame.name}", fontsize=10)
     if axes.get_legend_handles_labels()[0]:
         axes.legend(loc="upper right", fontsize=8)
-    return figure
 
 
-def plot_image(frame: Frame, detections: Objects) -> Figure:
-    """Camera image with the 3D boxes of labelled cars and detections, scores beside the latter."""
+def _draw_image(axes: Axes, frame: Frame, detections: Objects) -> None:
     height, width = frame.image.shape[:2]
-    figure = Figure(figsize=(9.0, 9.0 * height / width), layout="constrained")
-    axes = figure.subplots()
     axes.imshow(frame.image)
     groups = [(detections, FOUND)]
     if frame.labels is not None:
@@ -84,6 +77,48 @@ def plot_image(frame: Frame, detections: Objects) -> Figure:
         axes.text(box[0], box[1] - 2, f"{score:.2f}", color=FOUND, fontsize=7, va="bottom")
     axes.set(xlim=(-0.5, width - 0.5), ylim=(height - 0.5, -0.5))
     axes.set_axis_off()
+
+
+def plot_bird(
+    frame: Frame,
+    detections: Objects,
+    *,
+    x_range: tuple[float, float] = (-25.0, 25.0),
+    z_range: tuple[float, float] = (0.0, 50.0),
+) -> Figure:
+    """Lidar points from above with labelled cars and detections; thick edges are fronts."""
+    figure = Figure(figsize=(6.4, 6.4), layout="constrained")
+    _draw_bird(figure.subplots(), frame, detections, x_range, z_range)
+    return figure
+
+
+def plot_image(frame: Frame, detections: Objects) -> Figure:
+    """Camera image with the 3D boxes of labelled cars and detections, scores beside the latter."""
+    height, width = frame.image.shape[:2]
+    figure = Figure(figsize=(9.0, 9.0 * height / width), layout="constrained")
+    _draw_image(figure.subplots(), frame, detections)
+    return figure
+
+
+def plot_detections(frames: Sequence[Frame], detections: Sequence[Objects]) -> Figure:
+    """Frames below each other: the image with boxes, and the road from above.
+
+    Raises:
+        ValueError: no frame, or not as many detections as frames.
+    """
+    if not frames or len(frames) != len(detections):
+        raise ValueError(
+            f"{len(frames)} frames and {len(detections)} sets of detections, expected the same "
+            "number, at least one"
+        )
+    n = len(frames)
+    figure = Figure(figsize=(10.0, 2.7 * n), layout="constrained")
+    panels = figure.subplots(n, 2, squeeze=False, width_ratios=(2.6, 1.0))
+    for (left, right), frame, found in zip(panels, frames, detections, strict=True):
+        _draw_image(left, frame, found)
+        _draw_bird(right, frame, found, (-25.0, 25.0), (0.0, 50.0))
+        if right is not panels[0, 1] and (legend := right.get_legend()) is not None:
+            legend.remove()
     return figure
 
 

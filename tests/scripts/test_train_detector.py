@@ -13,15 +13,17 @@ from PIL import Image
 from fusion.detection.cache import open_cache, prepare_cache, read_example, split_frames
 from fusion.detection.calibration import Calibration
 from fusion.detection.io import (
+    read_labels,
     read_results,
     write_calibration,
     write_labels,
     write_plane,
     write_points,
+    write_results,
 )
 from fusion.detection.objects import Objects
 from fusion.detection.settings import CAR_SIZES
-from scripts import study_detector, study_geometry
+from scripts import draw_detections, study_detector, study_geometry
 from scripts import train_detector as command
 
 
@@ -184,6 +186,23 @@ def test_geometry_is_recorded(
     assert 5 < share < 95
     assert values["fitted against given plane, height, largest"] < 0.02
     assert values["height of a car's bottom above the fitted plane, mean size"] < 0.02
+
+
+def test_detections_are_drawn(root: Path, tmp_path: Path) -> None:
+    for name in ("000001", "000002"):
+        labels = read_labels(root / "training" / "label_2" / f"{name}.txt")
+        found = dataclasses.replace(
+            labels, score=np.full(len(labels), 0.1 if name[-1] == "1" else 1.0)
+        )
+        write_results(tmp_path / "found" / f"{name}.txt", found)
+    options = draw_detections.Config(
+        root, tmp_path / "found", tmp_path / "a" / "picture.png", min_cars=1
+    )
+    assert draw_detections.main(options) == {"frames": ["000001", "000002"], "detections": 1}
+    with Image.open(options.out) as picture:
+        assert picture.size == (700, 378)
+    with pytest.raises(ValueError, match="no frame with a result file has 2 labelled cars"):
+        draw_detections.main(dataclasses.replace(options, min_cars=2))
 
 
 def test_runs_of_other_settings_are_not_mixed(root: Path, tmp_path: Path) -> None:

@@ -164,8 +164,9 @@ AREAS = {
     ),
     "robots": (
         "train_snn", "study_transfer", "study_snn", "figures_snn", "compare_snn", "bench_snn",
-        "train_rl", "sweep", "bench_sweep",
+        "train_rl",
     ),
+    "sweeps": ("sweep", "bench_sweep"),
     "fusion": ("train_argate", "study_argate", "bench_fusion", "bench_lattice", "reproduce"),
     "circuits": (
         "find_failures", "study_failures", "study_active", "study_circuits", "study_parity",

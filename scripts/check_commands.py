@@ -207,11 +207,8 @@ def work(folder: Path, numbers: Sequence[int]) -> None:
         with into_files(logs / "frames"):
             make_frames(folder)
     for number in numbers:
-        command = commands[number]
-        if command.rule and command.rule.forget:
-            (folder / command.rule.forget).unlink(missing_ok=True)
         start, used = time.monotonic(), cpu_seconds()
-        error = execute(command.words, logs / f"{number:03d}")
+        error = execute(commands[number].words, logs / f"{number:03d}")
         if (pyplot := sys.modules.get("matplotlib.pyplot")) is not None:
             pyplot.close("all")
         done = Done(number, time.monotonic() - start, cpu_seconds() - used, error)
@@ -272,6 +269,9 @@ def run_all(config: Config, folder: Path, chosen: dict[int, _commands.Command]) 
     areas: dict[str, list[int]] = {}
     for number, command in chosen.items():
         areas.setdefault(command.area, []).append(number)
+        # Before anything runs: another process must not see a file go.
+        if command.rule and command.rule.forget:
+            (folder / command.rule.forget).unlink(missing_ok=True)
     if _commands.FUSION_DATA in areas:
         make_data(folder / "data")
     finished: list[Done] = []

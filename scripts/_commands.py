@@ -30,7 +30,8 @@ class Rule:
         small: options that are appended.
         not_run: why it is not run at all.
         needs: a program or a Python package that has to be there.
-        forget: files of the copy that would let the command find its work done.
+        forget: a file of the copy that would let the command find its work done.
+        held: a file of the copy and its text, which save a search for what nobody looks at.
     """
 
     words: str
@@ -38,6 +39,7 @@ class Rule:
     not_run: str = ""
     needs: str = ""
     forget: str = ""
+    held: tuple[str, str] | None = None
 
 
 _TORCH = "compares with PyTorch, which the tests do not install (extra `bench`)"
@@ -100,6 +102,10 @@ RULES = (
     Rule(
         "study_failures.py",
         "--seeds 1 --methods pbo --n-total 51 --no-probability --out runs/study_failures",
+        held=(
+            "runs/study_failures/ldo/load_regulation/box/threshold.json",
+            '{"threshold": 0.01, "nominal": 0.0, "worst": 0.02}',
+        ),
     ),
     Rule("study_active.py", "--specs undershoot --samples 50 --steps 2"),
     Rule("study_circuits.py", "--starts 2 --steps 1 --samples 20"),

@@ -272,6 +272,8 @@ def run_all(config: Config, folder: Path, chosen: dict[int, _commands.Command]) 
         # Before anything runs: another process must not see a file go.
         if command.rule and command.rule.forget:
             (folder / command.rule.forget).unlink(missing_ok=True)
+        if command.rule and command.rule.held:
+            _run.write_text(folder / command.rule.held[0], command.rule.held[1])
     if _commands.FUSION_DATA in areas:
         make_data(folder / "data")
     finished: list[Done] = []

@@ -74,6 +74,9 @@ class Config:
     """Radius of the ball [sigma]."""
     retrain_every: int = 100
     """Simulations between trainings of a Rev-ARGate; the first is on the 50 initial ones."""
+    together: bool = False
+    """Run the methods of a task at once, their simulations in common batches: faster where a call
+    of the simulator costs more than a sample; CPU time by method is not known then."""
     probability: bool = True
     """Estimate the failure probability at each threshold."""
     out: Path = Path("runs/study_failures")
@@ -110,7 +113,13 @@ def describe(values: Any) -> dict[str, Any]:
 
 
 def rows_of(
-    circuit: str, spec: Any, task: str, method: str, y: Any, target: dict[str, Any], seconds: float
+    circuit: str,
+    spec: Any,
+    task: str,
+    method: str,
+    y: Any,
+    target: dict[str, Any],
+    seconds: float | None,
 ) -> list[dict[str, Any]]:
     """The rows of one method: first failure, share of runs with one, worst case."""
     import numpy as np
@@ -176,14 +185,40 @@ def targets_of(config: Config, circuit: Any, column: int, task: Any, folder: Pat
     return target
 
 
+def run_method(
+    config: Config,
+    circuit: Any,
+    column: int,
+    task: Any,
+    folder: Path,
+    method: str,
+    simulate: Any,
+) -> Any:
+    """All searches of one method, or what is missing of them; returns their history."""
+    from failure.bayesopt import SearchConfig
+    from failure.runs import run
+
+    search = SearchConfig(
+        task,
+        method,
+        seeds=tuple(range(config.seeds)),
+        n_total=config.n_total,
+        retrain_every=config.retrain_every,
+        embedding_dim=EMBEDDING_DIM.get(config.circuit),
+    )
+    sense = circuit.specs[column].sense
+    return run(search, simulate, column, sense=sense, folder=folder / method)
+
+
 def main(config: Config) -> dict[str, Any]:
     """Run or finish the study; returns all rows."""
     import time
+    from functools import partial
 
     from failure import circuits, plots
-    from failure.bayesopt import METHODS, SearchConfig
+    from failure.bayesopt import METHODS
     from failure.embeddings import Task
-    from failure.runs import run
+    from failure.sharing import side_by_side
 
     circuit = circuits.get(config.circuit)
     table, title = TABLES.get(config.circuit, (config.circuit, config.circuit))
@@ -201,27 +236,23 @@ def main(config: Config) -> dict[str, Any]:
                 task = Task(kind, float(size), circuit.n_dims)
                 folder = config.out / config.circuit / spec.name / kind
                 target = targets_of(config, circuit, column, task, folder)
+                search = partial(run_method, config, circuit, column, task, folder)
+                if config.together:
+                    side_by_side([partial(search, method) for method in methods], circuit.simulate)
                 outputs = {}
                 for method in methods:
                     bar.update(job, status=f"{spec.name} {kind} {method}")
-                    search = SearchConfig(
-                        task,
-                        method,
-                        seeds=tuple(range(config.seeds)),
-                        n_total=config.n_total,
-                        retrain_every=config.retrain_every,
-                        embedding_dim=EMBEDDING_DIM.get(config.circuit),
-                    )
                     started = time.process_time()
-                    state = run(
-                        search, circuit.simulate, column, sense=spec.sense, folder=folder / method
-                    )
+                    state = search(method, circuit.simulate)
                     spent = (time.process_time() - started) / config.seeds
-                    seconds = cached(folder / method / "cpu.json", lambda s=spent: {"seconds": s})
+                    if config.together and not (folder / method / "cpu.json").exists():
+                        seconds = None
+                    else:
+                        seconds = cached(
+                            folder / method / "cpu.json", lambda s=spent: {"seconds": s}
+                        )["seconds"]
                     outputs[METHODS[method].label] = state.y
-                    new = rows_of(
-                        config.circuit, spec, kind, method, state.y, target, seconds["seconds"]
-                    )
+                    new = rows_of(config.circuit, spec, kind, method, state.y, target, seconds)
                     rows += new
                     if config.record:
                         path = _run.RESULTS / f"table_{table.replace('.', '_')}.json"

@@ -85,7 +85,13 @@ RULES = (
         "simulate_kitti.py --layouts",
         "--frames 2 --val 2 --size tiny --out runs/kitti_layouts",
     ),
-    Rule("simulate_kitti.py", "--frames 2 --val 2 --size tiny"),
+    Rule("simulate_kitti.py", "--frames 2 --val 2 --test 2 --size tiny"),
+    Rule("study_geometry.py", "--frames 2 --any-size"),
+    Rule(
+        "draw_detections.py",
+        "--data runs/kitti --min-cars 0 "
+        "--found runs/detector/kitti_avod_argate_tiny_failures_s0/eval_val/data",
+    ),
     Rule("train_detector.py prepare", "--preset tiny --any-size"),
     Rule("train_detector.py train", "--preset tiny --steps 1 --overwrite"),
     Rule("train_detector.py eval", "--preset tiny --pictures 1"),
@@ -165,8 +171,8 @@ PLACEHOLDERS = {
 
 AREAS = {
     "detector": (
-        "simulate_kitti", "train_detector", "evaluate_kitti", "study_detector", "bench_detector",
-        "bench_kitti_eval",
+        "simulate_kitti", "train_detector", "evaluate_kitti", "study_detector", "study_geometry",
+        "draw_detections", "bench_detector", "bench_kitti_eval",
     ),
     "robots": (
         "train_snn", "study_transfer", "study_snn", "figures_snn", "compare_snn", "bench_snn",

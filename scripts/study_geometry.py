@@ -31,6 +31,8 @@ class Config:
     """Folder of simulated frames."""
     frames: int = 100
     """At most so many frames of each folder, the first ones."""
+    any_size: bool = False
+    """Accept images of other sizes than the benchmark's in `--real` as well."""
     results: Path = _run.RESULTS
 
 
@@ -103,7 +105,7 @@ def main(config: Config) -> dict[str, Any]:
     rows: list[dict[str, Any]] = []
     for model, folder in (("real", config.real), ("simulated", config.simulated)):
         if folder is not None:
-            for row in measure(folder, config.frames, any_size=model == "simulated"):
+            for row in measure(folder, config.frames, config.any_size or model == "simulated"):
                 rows.append({"model": model, "metric": "geometry"} | row)
     if not rows:
         raise ValueError("expected --real or --simulated, a folder of frames")

@@ -13,6 +13,7 @@ import json
 import math
 import os
 import platform
+import shlex
 import subprocess
 import sys
 import tempfile
@@ -125,17 +126,14 @@ def command_line() -> str:
         script = script.resolve().relative_to(REPOSITORY)
     except ValueError:
         script = Path(script.name)
-    arguments = []
-    skip = False
+    arguments: list[str] = []
     for argument in sys.argv[1:]:
-        if skip:
-            skip = False
-            argument = "$FUSION_DATA_DIR"
-        elif argument == "--data-dir":
-            skip = True
+        if arguments and arguments[-1] == "--data-dir":
+            arguments.append("$FUSION_DATA_DIR")
         elif argument.startswith("/"):
-            argument = f"PATH/{Path(argument).name}"
-        arguments.append(argument)
+            arguments.append(f"PATH/{Path(argument).name}")
+        else:
+            arguments.append(shlex.quote(argument))
     return " ".join(["python", str(script), *arguments])
 
 

@@ -34,7 +34,7 @@ from typing import Any
 
 import tyro
 
-from scripts import _commands, _run
+from scripts import _command_data, _commands, _run
 
 CHECKED = ("results", "docs", "README.md")
 """What no command may change in the repository itself."""
@@ -93,56 +93,6 @@ def copy_repository(target: Path) -> None:
         if (_run.REPOSITORY / name).is_file():
             (target / name).parent.mkdir(parents=True, exist_ok=True)
             shutil.copy2(_run.REPOSITORY / name, target / name)
-
-
-def make_data(folder: Path) -> None:
-    """Data sets with the published shapes and random values, as `$FUSION_DATA_DIR`."""
-    import csv
-
-    import numpy as np
-
-    from fusion.data import DRIVER_CHANNELS, DRIVER_CLASSES, DRIVER_SOURCE_CHANNELS
-    from fusion.data.driver import N_ROWS, N_TRIPS, OIL, OIL_IN_FILE
-    from fusion.data.har import COUNTS, N_TIME
-
-    rng = np.random.default_rng(0)
-    arrays: dict[str, Any] = {}
-    for part, subjects in (("train", range(1, 22)), ("test", range(22, 31))):
-        labels = rng.permutation(np.repeat(np.arange(1, 7), COUNTS[part]))
-        noise = rng.normal(size=(len(labels), 9, N_TIME))
-        arrays[f"X_{part}"] = (noise + 0.5 * labels[:, None, None]).astype(np.float32)
-        arrays[f"y_{part}"] = labels.astype(np.int8)
-        arrays[f"subject_{part}"] = np.resize(np.array(subjects), len(labels)).astype(np.int8)
-    (folder / "har").mkdir(parents=True)
-    np.savez(folder / "har" / "uci_har_inertial.npz", **arrays)
-
-    signals = sorted({*DRIVER_CHANNELS, *DRIVER_SOURCE_CHANNELS})
-    # Two trips for each driver, then one more each for as long as there are trips.
-    drivers = [DRIVER_CLASSES[i % len(DRIVER_CLASSES)] for i in range(N_TRIPS)]
-    lengths = [N_ROWS // N_TRIPS + (i < N_ROWS % N_TRIPS) for i in range(N_TRIPS)]
-    values = rng.integers(0, 100, size=(N_ROWS, len(signals))).tolist()
-    (folder / "driver").mkdir()
-    path = folder / "driver" / "hcrl_kia_soul.csv"
-    with path.open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        names = [OIL_IN_FILE if name == OIL else name for name in signals]
-        writer.writerow([*names, "Time(s)", "Class"])
-        rows = iter(values)
-        for driver, length in zip(drivers, lengths, strict=True):
-            writer.writerows([*next(rows), second + 1, driver] for second in range(length))
-
-
-def make_frames(folder: Path) -> None:
-    """Simulated frames under the names that the documentation gives to KITTI folders."""
-    from scripts import simulate_kitti
-
-    runs = folder / "runs"
-    simulate_kitti.main(
-        simulate_kitti.Config(out=runs / "kitti", frames=6, val=3, test=0, size="tiny")
-    )
-    (folder / "data").mkdir(exist_ok=True)
-    for link in (runs / "kitti_real", folder / "data" / "kitti"):
-        link.symlink_to(runs / "kitti", target_is_directory=True)
 
 
 @contextlib.contextmanager
@@ -205,7 +155,7 @@ def work(folder: Path, numbers: Sequence[int]) -> None:
     logs = folder / "logs"
     if any(commands[n].area == "detector" for n in numbers):
         with into_files(logs / "frames"):
-            make_frames(folder)
+            _command_data.make_frames(folder)
     for number in numbers:
         start, used = time.monotonic(), cpu_seconds()
         error = execute(commands[number].words, logs / f"{number:03d}")
@@ -275,7 +225,7 @@ def run_all(config: Config, folder: Path, chosen: dict[int, _commands.Command]) 
         if command.rule and command.rule.held:
             _run.write_text(folder / command.rule.held[0], command.rule.held[1])
     if _commands.FUSION_DATA in areas:
-        make_data(folder / "data")
+        _command_data.make_data(folder / "data")
     finished: list[Done] = []
     lock = threading.Lock()
 

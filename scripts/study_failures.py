@@ -93,6 +93,14 @@ def cached(path: Path, make: Any) -> Any:
     return json.loads(path.read_text(encoding="utf-8"))
 
 
+def _seconds(path: Path) -> float | None:
+    """CPU time of a method, where it was measured."""
+    if not path.exists():
+        return None
+    seconds: float = json.loads(path.read_text(encoding="utf-8"))["seconds"]
+    return seconds
+
+
 def describe(values: Any) -> dict[str, Any]:
     """Number, median and quartiles, mean and its interval of the finite values; all values."""
     import numpy as np
@@ -242,15 +250,15 @@ def main(config: Config) -> dict[str, Any]:
                 outputs = {}
                 for method in methods:
                     bar.update(job, status=f"{spec.name} {kind} {method}")
+                    # A resumed method, or one of several at once, has no CPU time of its own.
+                    spent = folder / method / "cpu.json"
+                    alone = not (folder / method / "evaluations.jsonl").exists()
                     started = time.process_time()
                     state = search(method, circuit.simulate)
-                    spent = (time.process_time() - started) / config.seeds
-                    if config.together and not (folder / method / "cpu.json").exists():
-                        seconds = None
-                    else:
-                        seconds = cached(
-                            folder / method / "cpu.json", lambda s=spent: {"seconds": s}
-                        )["seconds"]
+                    if alone:
+                        per_seed = (time.process_time() - started) / config.seeds
+                        _run.write_json(spent, {"seconds": per_seed})
+                    seconds = _seconds(spent)
                     outputs[METHODS[method].label] = state.y
                     new = rows_of(config.circuit, spec, kind, method, state.y, target, seconds)
                     rows += new

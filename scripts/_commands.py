@@ -1,7 +1,7 @@
 """The commands of the documentation: where they stand, and what makes each of them quick.
 
-A reader types the commands of README.md and docs/ as they are printed; CI types them with `SMALL`
-appended, so that the documented words stay and options that stand twice are overridden.
+A reader types the commands of README.md and docs/ as they are printed; `make commands` appends the
+options of a rule, so that the documented words stay and options that stand twice are overridden.
 `scripts/check_commands.py` runs them.
 """
 
@@ -56,7 +56,7 @@ RULES = (
         "sweep.py --distributed", not_run="is one of two machines; test_sweep_layouts.py runs two"
     ),
     Rule("make demo", not_run="takes minutes and has no smaller size; test_demo.py runs its parts"),
-    Rule("make", not_run="is what CI runs anyway"),
+    Rule("make", not_run="runs this or the test suite"),
     Rule("pip install", not_run="installs; the Makefile does it"),
     Rule("pytest", not_run="is part of the test suite"),
     # Chapter 2.

@@ -12,7 +12,7 @@ from scripts import _commands, _run, check_commands
 from scripts._commands import RULES, Command, Rule
 
 COMMANDS = _commands.documented()
-# Commands that CI does not run: one more has to be argued for, here and in the table.
+# Commands that `make commands` does not run: one more has to be argued for, here and in the table.
 NOT_RUN = 13
 
 

@@ -283,7 +283,6 @@ def test_collecting_from_single_runs(tmp_path: Path) -> None:
     assert line[1:4] == ["94.06", "99.00", "✓ better"] and line[-1] == "quick run"
 
 
-@pytest.mark.relaxed  # the optimizer's own promotions
 def test_models_of_other_chapters_start_no_search(tmp_path: Path) -> None:
     plan = _chapters.Plan(preset="quick", results=tmp_path, out=tmp_path, models=("S4", "baseline"))
     assert _chapters.failures(plan, ("4.1", "4.2")) == ({}, 0)
@@ -298,6 +297,7 @@ def test_times_of_the_tables_are_kept(tmp_path: Path) -> None:
         assert set(times[kind]) == {"4.1"} and times[kind]["4.1"] >= 0.0
 
 
+@pytest.mark.relaxed  # the optimizer's own promotions
 def test_without_har_the_quick_piece_says_that_it_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

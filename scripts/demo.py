@@ -18,7 +18,7 @@ from typing import Any
 
 import tyro
 
-from scripts import _report, _report_cells, _run
+from scripts import _report, _report_cells, _run, study_failures
 
 
 @dataclasses.dataclass(frozen=True)
@@ -78,8 +78,8 @@ def sensor_fusion(config: Config) -> dict[str, Any]:
 
 def _threshold_of_record(circuit: str, spec: str) -> float | None:
     """The failure threshold that Table 4.1 or 4.2 was made with; None where there is none."""
-    numbers = {"ldo": "4.1", "dcdc": "4.2"}
-    table = _report_cells.load_tables(_run.RESULTS).get(numbers.get(circuit, ""), {"rows": []})
+    number, _ = study_failures.TABLES.get(circuit, ("", ""))
+    table = _report_cells.load_tables(_run.RESULTS).get(number, {"rows": []})
     found = (row["threshold"] for row in table["rows"] if row["row"] == f"{spec} (box)")
     return next(found, None)
 

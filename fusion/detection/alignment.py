@@ -104,9 +104,10 @@ def projected_boxes(frame: Frame, objects: Objects) -> Float[np.ndarray, "k 4"]:
     return np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1)
 
 
-def _around(points: np.ndarray, cars: Objects) -> tuple[np.ndarray, np.ndarray]:
+def _around(points: np.ndarray, cars: Objects, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points around each car, and those of them that are among the points inside its box."""
     near = inside_boxes(points, cars, margin=MARGIN, clearance=CLEARANCE)
-    return near.sum(axis=0), (near & inside_boxes(points, cars)).sum(axis=0)
+    return near.sum(axis=0), (near & inside).sum(axis=0)
 
 
 def align_frame(frame: Frame, *, turn: float = 1.0) -> FrameAlignment:
@@ -135,12 +136,13 @@ def align_frame(frame: Frame, *, turn: float = 1.0) -> FrameAlignment:
     box = cars.bbox[None]
     at = pixels[seen][:, None]
     in_image_box = ((at >= box[..., :2]) & (at <= box[..., 2:])).all(axis=2)
-    around, around_in = _around(camera[seen], cars)
+    around, around_in = _around(camera[seen], cars, inside)
     angle = np.radians(turn)
     rotation = np.array(
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
     )
-    turned, turned_in = _around(lidar_to_camera(calibration, lidar[seen] @ rotation.T), cars)
+    scan = lidar_to_camera(calibration, lidar[seen] @ rotation.T)
+    turned, turned_in = _around(scan, cars, inside_boxes(scan, cars))
     whole = select(cars, cars.truncated == 0)
     plane = fit_plane(camera).plane
     return FrameAlignment(

@@ -41,6 +41,10 @@ def frame_part(split: str) -> str:
     return TESTING if split == TESTING else "training"
 
 
+def _example_folder(folder: Path, part: str) -> Path:
+    return folder / TESTING if part == TESTING else folder
+
+
 @dataclasses.dataclass(frozen=True)
 class Cache:
     """What `cache.json` says.
@@ -74,7 +78,7 @@ class Cache:
 
     def examples(self, split: str) -> Path:
         """Folder of a split's examples."""
-        return self.folder / TESTING if split == TESTING else self.folder
+        return _example_folder(self.folder, frame_part(split))
 
     def names(self, split: str) -> tuple[str, ...]:
         """Frames of a split.
@@ -191,7 +195,7 @@ def _read_frames(
             continue
         for key, value in left_out.items():
             counts[key] += int(value)
-        write_example(folder / TESTING if part == TESTING else folder, name, example)
+        write_example(_example_folder(folder, part), name, example)
         if on_frame is not None:
             on_frame(done + 1, len(frames), name)
     return counts

@@ -115,7 +115,7 @@ def test_the_command_names_no_folder_of_the_user(monkeypatch: pytest.MonkeyPatch
     monkeypatch.setattr(sys, "argv", [script, "--data-dir", "/home/me/data", "--model", "argate_l"])
     wanted = "python scripts/train_argate.py --data-dir $FUSION_DATA_DIR --model argate_l"
     assert _run.command_line() == wanted
-    monkeypatch.setattr(sys, "argv", [script, "--only", "tuned, gamma", "--out", "/tmp/x/y"])
+    monkeypatch.setattr(sys, "argv", [script, "--only", "tuned, gamma", "--out", "/home/me/runs/y"])
     assert _run.command_line().endswith("--only 'tuned, gamma' --out PATH/y")
 
 

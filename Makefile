@@ -56,7 +56,7 @@ docs: $(VENV)/.dev  ## build the documentation into site/
 wheel: $(VENV)/.dev  ## build the wheel and import it from outside the repository
 	$(BIN)/python scripts/check_wheel.py
 
-check: lint types docs wheel test commands  ## everything that CI runs, and the documented commands
+check: lint types docs wheel test commands  ## everything that CI runs but the report page
 
 clean:  ## remove what the other commands made, but not runs/ or results/
 	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

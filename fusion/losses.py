@@ -119,6 +119,8 @@ def argate_loss(
     weights: Float[Array, "b k"],
     aux_losses: Float[Array, "b k"] | None = None,
     targets: Float[Array, "b k"] | None = None,
+    target_losses: Float[Array, "b k"] | None = None,
+    counted: Float[Array, " b"] | None = None,
 ) -> LossTerms:
     r"""The training loss of a gated network with auxiliary paths.
 
@@ -137,6 +139,8 @@ def argate_loss(
         weights: fusion weights w.
         aux_losses: cross entropy of each auxiliary path, per example; None without auxiliary paths.
         targets: learned targets f_k(aux_losses); None for the fixed ones.
+        target_losses: losses that the fixed targets are made of; None for `aux_losses`.
+        counted: which examples the weights are regularized in, 1 or 0; None for all.
 
     Returns:
         The terms, scalars.
@@ -156,11 +160,13 @@ def argate_loss(
         auxiliary = jnp.mean(aux_losses)
     regularization = anchor = zero
     if config.regularization:
-        seen = jax.lax.stop_gradient(aux_losses) if config.stop_targets else aux_losses
+        seen = aux_losses if target_losses is None else target_losses
+        seen = jax.lax.stop_gradient(seen) if config.stop_targets else seen
         fixed = loss_targets(seen, config.normalizer, params.tau)
         target = fixed if targets is None else targets
-        regularization = jnp.mean(jnp.sum((weights - target) ** 2, axis=-1))
+        share = jnp.ones(weights.shape[:1]) if counted is None else counted
+        regularization = jnp.mean(share * jnp.sum((weights - target) ** 2, axis=-1))
         if targets is not None:
-            anchor = jnp.mean(jnp.sum((targets - fixed) ** 2, axis=-1))
+            anchor = jnp.mean(share * jnp.sum((targets - fixed) ** 2, axis=-1))
     total = main + params.alpha * auxiliary + params.beta * regularization + params.anchor * anchor
     return LossTerms(total, main, auxiliary, regularization, anchor)

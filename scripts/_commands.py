@@ -46,6 +46,19 @@ _TORCH = "compares with PyTorch, which the tests do not install (extra `bench`)"
 _ROBOT = "--seeds 1 --max-steps 3"
 _HAR = "--preset quick --seeds 1 --models baseline --shard 0/12 --out runs/tables"
 _SEARCH = "--seeds 1 --threshold 1 --overwrite"
+_STUDY = (
+    "--seeds 1 --tasks box --methods pbo monte_carlo --n-total 51 --no-probability "
+    "--out runs/study_failures"
+)
+
+_ACTIVE = "--samples 50 --steps 2 --specs"
+
+
+def _threshold(folder: str) -> tuple[str, str]:
+    """A file that saves the search for a threshold."""
+    text = '{"threshold": 0.01, "nominal": 0.0, "worst": 0.02}'
+    return f"runs/study_failures/{folder}/box/threshold.json", text
+
 
 RULES = (
     # Not run. tests/scripts/test_check_commands.py holds their number.
@@ -106,14 +119,19 @@ RULES = (
     Rule("find_failures.py rev_argate_bnn", f"{_SEARCH} --n-total 51"),
     Rule("find_failures.py", f"{_SEARCH} --n-init 6 --n-total 8"),
     Rule(
-        "study_failures.py",
-        "--seeds 1 --methods pbo --n-total 51 --no-probability --out runs/study_failures",
-        held=(
-            "runs/study_failures/ldo/load_regulation/box/threshold.json",
-            '{"threshold": 0.01, "nominal": 0.0, "worst": 0.02}',
-        ),
+        "study_failures.py dcdc",
+        f"{_STUDY} --specs output_accuracy",
+        held=_threshold("dcdc/output_accuracy"),
     ),
-    Rule("study_active.py", "--specs undershoot --samples 50 --steps 2"),
+    Rule(
+        "study_failures.py",
+        f"{_STUDY} --specs load_regulation",
+        held=_threshold("ldo/load_regulation"),
+    ),
+    # Samples of the searches above.
+    Rule("study_active.py dcdc --runs", f"{_ACTIVE} output_accuracy --runs runs/study_failures"),
+    Rule("study_active.py --runs", f"{_ACTIVE} load_regulation --runs runs/study_failures"),
+    Rule("study_active.py", f"{_ACTIVE} undershoot"),
     Rule("study_circuits.py", "--starts 2 --steps 1 --samples 20"),
     Rule(
         "study_parity.py",

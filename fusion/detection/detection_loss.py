@@ -19,7 +19,7 @@ from jaxtyping import Array, Float
 from fusion.detection.sampling import Sample
 from fusion.losses import cross_entropy
 
-__all__ = ["StageLoss", "class_loss", "regression_loss", "smooth_l1"]
+__all__ = ["StageLoss", "balanced_class_loss", "class_loss", "regression_loss", "smooth_l1"]
 
 
 class StageLoss(NamedTuple):
@@ -53,6 +53,21 @@ def class_loss(
     """Mean cross entropy over the mini-batch; class 1 is the object, class 0 the background."""
     losses = cross_entropy(scores, sample.positive.astype(jnp.int32), smoothing)
     return _mean(losses, sample.valid)
+
+
+def balanced_class_loss(scores: Float[Array, "m 2"], sample: Sample) -> Float[Array, ""]:
+    r"""Cross entropy in which positives and negatives weigh alike, however few the positives are.
+
+    .. math:: L_{bal} = \tfrac{1}{2} \overline{\mathrm{CE}}_{P} + \tfrac{1}{2}
+        \overline{\mathrm{CE}}_{B \setminus P}
+
+    The mean over the mini-batch says above all how many objects a frame holds; this one says how
+    well they are told from the background: near log 2 for scores that know nothing and are not
+    sure of themselves.
+    """
+    losses = cross_entropy(scores, sample.positive.astype(jnp.int32))
+    negative = sample.valid & ~sample.positive
+    return 0.5 * (_mean(losses, sample.positive) + _mean(losses, negative))
 
 
 def regression_loss(

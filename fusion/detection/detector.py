@@ -109,18 +109,32 @@ def _teach_if_alive(features: Array, reading: Array) -> Array:
 
 
 class AuxiliaryHeads(nn.Module):
-    """One first-stage head per view, on that view's crops alone (training only)."""
+    """A path through both stages for each view, on that view's crops alone (training only)."""
 
     config: DetectorConfig
 
-    @nn.compact
-    def __call__(self, crops: tuple[Array, Array], train: bool) -> list[tuple[Array, Array]]:
-        """Scores and offsets of each view."""
+    def setup(self) -> None:
+        """Heads of the main network's sizes."""
         c = self.config
-        return [
-            RpnHead(c.rpn_width, c.dropout, name=sensor)(x, train)
-            for sensor, x in zip(SENSORS, crops, strict=True)
-        ]
+        self.rpn = [RpnHead(c.rpn_width, c.dropout, name=sensor) for sensor in SENSORS]
+        if c.auxiliary_second:
+            self.second = [
+                SecondHead(c.fc_widths, c.dropout, name=f"{sensor}_second") for sensor in SENSORS
+            ]
+
+    def first_stage(self, crops: tuple[Array, Array], train: bool) -> list[tuple[Array, ...]]:
+        """Scores and offsets of each view."""
+        return [head(x, train) for head, x in zip(self.rpn, crops, strict=True)]
+
+    def second_stage(self, crops: tuple[Array, Array], train: bool) -> list[tuple[Array, ...]]:
+        """Class scores, corner offsets and angle vector of each view."""
+        return [head(x, train) for head, x in zip(self.second, crops, strict=True)]
+
+    def __call__(self, first: tuple[Array, Array], second: tuple[Array, Array]) -> None:
+        """Touch every parameter once (for `init`)."""
+        self.first_stage(first, False)
+        if self.config.auxiliary_second:
+            self.second_stage(second, False)
 
 
 def crop_views(
@@ -142,9 +156,10 @@ def fuse(crops: tuple[Array, Array], scale: Float[Array, "b 2"]) -> Array:
 
 
 def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
-    """Fresh parameters `{"main", "auxiliary", "targets"}` and the statistics of batch norm.
+    """Fresh parameters and the statistics of batch norm (empty with group norm).
 
-    `avod` has `main` alone; the statistics are empty with group norm.
+    Parameters are `main` and, for `avod_argate`, those that training alone needs: `auxiliary`
+    (the paths of the views), `targets` (the lattice), `usual_losses` (of the paths).
     """
     main_key, aux_key, target_key = jax.random.split(key, 3)
 
@@ -155,10 +170,14 @@ def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
     variables = draw_weights(main_key, Detector(config), image, bev, scales=_OUTPUTS)
     params: dict[str, Any] = {"main": variables["params"]}
     if config.model == "avod_argate":
-        crop = shape(config.rpn_crop, config.rpn_crop, 1)
-        heads = draw_weights(aux_key, AuxiliaryHeads(config), (crop, crop), False, scales=_OUTPUTS)
+        first = shape(config.rpn_crop, config.rpn_crop, 1)
+        second = shape(config.second_crop, config.second_crop, config.widths[0])
+        heads = draw_weights(
+            aux_key, AuxiliaryHeads(config), (first, first), (second, second), scales=_OUTPUTS
+        )
         params["auxiliary"] = heads["params"]
         params["targets"] = init_targets(target_key, config.targets, 2)
+        params["usual_losses"] = jnp.full(2, jnp.log(2.0))
     return params, variables.get("batch_stats", {})
 
 

@@ -4,22 +4,22 @@ r"""What training minimizes: the losses of both stages, and the gate's of Equati
     L = L^{rpn}_{cls} + 5 L^{rpn}_{reg} + L^{2}_{cls} + 5 L^{2}_{reg} + L^{2}_{ang}
       + \alpha \sum_k w_k L^{aux}_k + \beta \sum_k \big(w_k - f_k(L^{aux})\big)^2 + \dots
 
-:math:`L^{aux}_k` is the first stage's loss of a head that reads view k alone. `avod` has the first
-five terms.
+:math:`L^{aux}_k` is the loss of both stages of a path that reads view k alone. `avod` has the first
+five terms. See
+`gate_objective` for the last three.
 
 Source: Ku et al. (2018), section III-E; M. S. Shim (2020), Equation 3.2 and section 3.3.2.2.
 """
 
 from __future__ import annotations
 
-import dataclasses
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, PRNGKeyArray
 
-from fusion.detection.detection_loss import class_loss, regression_loss
+from fusion.detection.detection_loss import regression_loss
 from fusion.detection.detector import AuxiliaryHeads, Detector, Encoded, crop_views, fuse
 from fusion.detection.encodings import (
     anchor_ground,
@@ -30,12 +30,11 @@ from fusion.detection.encodings import (
     encode_offsets,
 )
 from fusion.detection.examples import Inputs
+from fusion.detection.gate_objective import PathLosses, class_losses, gate_terms, path_losses
 from fusion.detection.proposals import anchor_boxes, propose, view_boxes
-from fusion.detection.sampling import Sample, assign, draw
+from fusion.detection.sampling import assign, draw
 from fusion.detection.settings import DetectorConfig
 from fusion.gating import drop_modalities
-from fusion.losses import argate_loss
-from fusion.targets import apply_targets
 
 __all__ = ["DetectorLoss", "detector_loss"]
 
@@ -97,31 +96,6 @@ def _with_truth(
     return jnp.concatenate([proposals, shifted], 1), jnp.concatenate([found, mask], 1)
 
 
-def _first_stage_loss(
-    objectness: Array, offsets: Array, target: Array, sample: Sample, config: DetectorConfig
-) -> tuple[Array, Array]:
-    """Class and box loss of every frame `[b]`."""
-    smoothing = config.label_smoothing
-    classes = jax.vmap(lambda s, m: class_loss(s, m, smoothing))(objectness, sample)
-    return classes, jax.vmap(regression_loss)(offsets, target, sample)
-
-
-def _gate_terms(
-    params: Any, config: DetectorConfig, weights: Array, aux_losses: Array
-) -> tuple[Array, Array, Array]:
-    """The gate's part of the loss, the auxiliary and the regularization term."""
-    options = dataclasses.replace(config.gate_loss, normalizer=config.normalizer)
-    seen = jax.lax.stop_gradient(aux_losses) if options.stop_targets else aux_losses
-    targets = None
-    if options.learned_targets:
-        targets = apply_targets(params["targets"], config.targets, seen)
-    # The cross entropy of a single class is zero: what is left are the terms of the gate.
-    none = jnp.zeros((weights.shape[0], 1))
-    labels = jnp.zeros(weights.shape[0], jnp.int32)
-    terms = argate_loss(options, config.gate_params, none, labels, weights, aux_losses, targets)
-    return terms.total, terms.auxiliary, terms.regularization
-
-
 def _encode(params: Any, stats: Any, config: DetectorConfig, inputs: Inputs) -> tuple[Encoded, Any]:
     variables = {"params": params["main"], "batch_stats": stats}
     encoded, changed = Detector(config).apply(
@@ -149,6 +123,7 @@ def detector_loss(
     model: Any = Detector(config)
     stop = jax.lax.stop_gradient
     path_key, rpn_key, second_key, jitter_key, drop1, drop2, drop3 = jax.random.split(key, 7)
+    drop4 = jax.random.fold_in(drop2, 1)
     main = {"params": params["main"]}
     encoded, new_stats = _encode(params, stats, config, inputs)
     kept = drop_modalities(path_key, jnp.ones((2, b, 1)), c.path_drop)[:, :, 0].T
@@ -178,17 +153,14 @@ def detector_loss(
     scores, offsets = model.apply(
         main, fuse(crops, scale), True, method="first_stage", rngs={"dropout": drop1}
     )
-    rpn_classes, rpn_boxes = _first_stage_loss(scores, offsets, target, sample, c)
-
-    gate = auxiliary = regularization = jnp.zeros(())
+    rpn_classes = class_losses(scores, sample, c)
+    rpn_boxes = jax.vmap(regression_loss)(offsets, target, sample)
+    paths: list[PathLosses] = []
+    alone: Any = AuxiliaryHeads(c)
     if c.model == "avod_argate":
-        auxiliary_heads: Any = AuxiliaryHeads(c)
-        heads = auxiliary_heads.apply(
-            {"params": params["auxiliary"]}, crops, True, rngs={"dropout": drop2}
-        )
-        parts = [_first_stage_loss(s, o, target, sample, c) for s, o in heads]
-        aux_losses = jnp.stack([cls + c.regression_weight * box for cls, box in parts], axis=1)
-        gate, auxiliary, regularization = _gate_terms(params, c, encoded.weights, aux_losses)
+        held = {"params": params["auxiliary"]}
+        heads = alone.apply(held, crops, True, method="first_stage", rngs={"dropout": drop2})
+        paths.append(path_losses(heads, (target,), sample, c))
 
     # Second stage: a mini-batch of proposals.
     proposals, found = _with_truth(
@@ -209,9 +181,15 @@ def detector_loss(
     wanted = _take(corners(truth, inputs.plane), match)
     wanted = wanted - corners(jax.vmap(anchor_boxes)(rois), inputs.plane)
     heading = jax.vmap(angle_vector)(_take(truth[..., 6:], match)[..., 0])
-    classes = jax.vmap(lambda s, m: class_loss(s, m, c.label_smoothing))(scores, sample2)
+    classes = class_losses(scores, sample2, c)
     boxes = jax.vmap(regression_loss)(offsets, wanted, sample2)
     angles = jax.vmap(regression_loss)(angle, heading, sample2)
+    gate = auxiliary = regularization = jnp.zeros(())
+    if c.model == "avod_argate":
+        if c.auxiliary_second:
+            heads = alone.apply(held, crops, True, method="second_stage", rngs={"dropout": drop4})
+            paths.append(path_losses(heads, (wanted, heading), sample2, c))
+        gate, auxiliary, regularization = gate_terms(params, c, encoded.weights, paths)
 
     frames = (
         rpn_classes

@@ -45,6 +45,11 @@ class DetectorConfig:
         final_nms, max_detections, score_threshold: of the result.
         label_smoothing, regression_weight, angle_weight: of the losses.
         gate_loss, gate_params, targets: terms of Equation 3.2, see `fusion.losses`.
+        auxiliary_second: the auxiliary paths of the views go on through the second stage.
+        balanced_paths: the class losses of these paths weigh positives and negatives alike, and
+            the targets see how far their mean lies above what is usual for the view, in frames
+            with positives; else class losses are means over the mini-batch and the targets see the
+            whole losses of the paths.
     """
 
     model: DetectorModel = "avod_argate"
@@ -86,6 +91,8 @@ class DetectorConfig:
     targets: TargetConfig = dataclasses.field(
         default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0))
     )
+    auxiliary_second: bool = True
+    balanced_paths: bool = True
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""

@@ -56,7 +56,9 @@ class DetectorTraining:
             to zero after a warm-up over the first 5 %.
         l2, l2_dense: weight of the squared parameters of convolutions and first stage, and of the
             second stage's dense layers.
-        clip_norm: bound of the gradient's norm.
+        clip_norm: bound of the gradient's norm, lattice aside.
+        target_rate: factor of the learning rate for the lattice of the targets, a few numbers that
+            have to keep up with the losses of the paths.
         flip: mirror half of the frames; colour_sd: shift of the colour channels.
         failure_share: frames in which one sensor fails (half camera, half lidar); the source keeps
             a third clean in its other experiments.
@@ -71,6 +73,7 @@ class DetectorTraining:
     l2: float = 5e-4
     l2_dense: float = 5e-3
     clip_norm: float = 10.0
+    target_rate: float = 10.0
     flip: bool = True
     colour_sd: float = 0.02
     failure_share: float = 0.0
@@ -123,15 +126,26 @@ def _l2(train: DetectorTraining, params: Any) -> Any:
 
     def decay(path: Any, _: Array) -> float:
         names = [str(getattr(entry, "key", entry)) for entry in path]
-        if names[0] == "targets" or names[-1] != "kernel":
+        if names[-1] != "kernel":
             return 0.0
         return train.l2_dense if "second" in names else train.l2
 
     return jax.tree_util.tree_map_with_path(decay, params)
 
 
+def _parts(params: Any) -> dict[str, str]:
+    """Which optimizer moves what."""
+    beside = ("targets", "usual_losses")
+    return {name: "targets" if name in beside else "network" for name in params}
+
+
 def _optimizer(train: DetectorTraining) -> optax.GradientTransformation:
-    return optax.chain(optax.clip_by_global_norm(train.clip_norm), optax.scale_by_adam())
+    clip = optax.clip_by_global_norm(train.clip_norm)
+    parts = {
+        "network": optax.chain(clip, optax.scale_by_adam()),
+        "targets": optax.chain(optax.scale_by_adam(), optax.scale(train.target_rate)),
+    }
+    return optax.partition(parts, _parts)
 
 
 def init_training(

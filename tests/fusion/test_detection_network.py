@@ -17,11 +17,12 @@ from fusion.detection import fitting
 from fusion.detection.calibration import Calibration
 from fusion.detection.convolution import convolve
 from fusion.detection.detect import to_objects
-from fusion.detection.detection_loss import class_loss, regression_loss
+from fusion.detection.detection_loss import balanced_class_loss, class_loss, regression_loss
 from fusion.detection.detector import count_main_parameters, fuse, init_detector
 from fusion.detection.encodings import box3d_to_box4c, box_corners, project_boxes
 from fusion.detection.examples import Example, flip, make_example, make_inputs, stack_examples
 from fusion.detection.fitting import fit_detector, frame_order, run_detector
+from fusion.detection.gate_objective import gate_terms, path_losses
 from fusion.detection.group_norm import GROUP_SIZE, group_norm_relu
 from fusion.detection.io import Frame
 from fusion.detection.objects import Objects
@@ -183,7 +184,8 @@ def test_parameters_match_and_weights_start_even() -> None:
         assert avod < argate < 1.02 * avod
     batch_norm = dataclasses.replace(TINY, norm="batch")
     params, stats = jax.jit(partial(init_detector, config=batch_norm))(jax.random.key(0))
-    assert set(params) == {"main", "auxiliary", "targets"} and jax.tree.leaves(stats)
+    assert set(params) == {"main", "auxiliary", "targets", "usual_losses"}
+    assert jax.tree.leaves(stats)
     assert float(jnp.abs(params["main"]["gate"]["fusion"]["kernel"]).max()) == 0
     kernel = params["main"]["second"]["fc0"]["kernel"]
     np.testing.assert_allclose(kernel.std(), np.sqrt(2 / kernel.shape[0]), rtol=0.1)
@@ -227,11 +229,48 @@ def test_losses_by_hand() -> None:
     scores = jnp.log(jnp.array([[0.25, 0.75], [0.5, 0.5], [1e-6, 1.0], [0.9, 0.1]]))
     expected = -(np.log(0.75) + np.log(0.5) + np.log(0.1)) / 3
     np.testing.assert_allclose(class_loss(scores, sample), expected, rtol=1e-5)
+    balanced = -0.25 * (np.log(0.75) + np.log(0.1)) - 0.5 * np.log(0.5)
+    np.testing.assert_allclose(balanced_class_loss(scores, sample), balanced, rtol=1e-5)
     predicted = jnp.array([[0.5, 2.0], [9.0, 9.0], [9.0, 9.0], [0.0, 0.0]])
     got = regression_loss(predicted, jnp.zeros((4, 2)), sample)
     np.testing.assert_allclose(got, (0.125 + 1.5) / 2)
     nothing = Sample(jnp.arange(4), jnp.zeros(4, bool), jnp.ones(4, bool))
     assert float(regression_loss(predicted, jnp.zeros((4, 2)), nothing)) == 0
+
+
+def test_gate_is_regularized_by_what_the_views_tell_apart() -> None:
+    sample = Sample(
+        jnp.arange(4)[None], jnp.array([[True, False, False, False]]), jnp.ones((1, 4), bool)
+    )
+    knows = jnp.array([[[-3.0, 3], [3, -3], [3, -3], [3, -3]]])
+    views = [(jnp.zeros((1, 4, 2)), jnp.zeros((1, 4, 6))), (knows, jnp.ones((1, 4, 6)))]
+    config = dataclasses.replace(
+        TINY, gate_loss=dataclasses.replace(TINY.gate_loss, learned_targets=False)
+    )
+    even, wanted = jnp.full((1, 2), 0.5), (jnp.zeros((1, 4, 6)),)
+    stage = path_losses(views, wanted, sample, config)
+    told = np.log1p(np.exp(-6.0))
+    np.testing.assert_allclose(stage.balanced, [[np.log(2), told]], rtol=1e-4)
+    # Boxes: half the square of 1 in six columns, times their weight.
+    boxes = 3.0 * config.regression_weight
+    np.testing.assert_allclose(stage.whole, [[np.log(2), told + boxes]], rtol=1e-4)
+    # Its boxes are worse, and yet the second view's weight should rise: it tells objects from the
+    # background better than it usually does, by more than the first one.
+    usual = jnp.array([0.6, 0.1])
+    params = {"usual_losses": usual}
+    target = jax.nn.softmax(-(stage.balanced - usual[None]) / config.gate_params.tau)
+    assert target[0, 1] > 0.5
+    total, auxiliary, regularization = gate_terms(params, config, even, [stage, stage])
+    off = 0.5 * ((stage.balanced - usual[None]) ** 2).sum()
+    parts = config.gate_params.alpha * auxiliary + config.gate_params.beta * regularization
+    np.testing.assert_allclose(total, parts + off, rtol=1e-4)
+    np.testing.assert_allclose(auxiliary, stage.whole.sum(), rtol=1e-4)  # half of each, twice
+    np.testing.assert_allclose(regularization, ((0.5 - target) ** 2).sum(), rtol=1e-4)
+    # A frame without objects says nothing about its sensors.
+    empty = path_losses(views, wanted, sample._replace(positive=jnp.zeros((1, 4), bool)), config)
+    assert float(gate_terms(params, config, even, [empty])[2]) == 0.0
+    slope = jax.grad(lambda p: gate_terms(p, config, even, [stage])[0])(params)
+    np.testing.assert_allclose(slope["usual_losses"], usual - stage.balanced[0], rtol=1e-3)
 
 
 def test_right_offsets_decode_to_the_label() -> None:

@@ -74,6 +74,19 @@ def test_learned_targets_replace_the_fixed_ones() -> None:
     np.testing.assert_allclose(terms.total, total, rtol=1e-6)
 
 
+def test_targets_from_other_losses_in_the_examples_that_count() -> None:
+    other, counted = _aux_losses()[::-1].copy(), np.array([1.0, 0, 1, 1, 0], np.float32)
+    config = LossConfig(learned_targets=False, label_smoothing=0.0, uniform_floor=1.0)
+    terms = argate_loss(
+        config, LossParams(1.0, 1.0, 0.5), jnp.asarray(LOGITS), jnp.asarray(LABELS),
+        jnp.asarray(W), jnp.asarray(_aux_losses(), jnp.float32),
+        target_losses=jnp.asarray(other, jnp.float32), counted=jnp.asarray(counted),
+    )  # fmt: skip
+    squares = ((W - _softmax(-other / 0.5)) ** 2).sum(1)
+    np.testing.assert_allclose(terms.regularization, (counted * squares).mean(), rtol=1e-4)
+    np.testing.assert_allclose(terms.auxiliary, _aux_losses().mean(), rtol=1e-5)
+
+
 def test_range_of_the_printed_targets() -> None:
     best = jnp.asarray([[0.0] + [50.0] * 8])
     worst = jnp.asarray([[50.0] + [0.0] * 8])

@@ -172,6 +172,12 @@ def resolved(detector: Any, training: Any) -> dict[str, Any]:
     for name in ("gate_params", "gate_loss"):
         value = parts["detector"][name]
         parts["detector"][name] = value._asdict() if hasattr(value, "_asdict") else value
+    if detector.model == "avod":
+        # What only the gate reads may differ.
+        of_gate = ("gate", "targets", "auxiliary", "balanced", "normalizer")
+        kept = {k: v for k, v in parts["detector"].items() if not k.startswith(of_gate)}
+        parts["detector"] = kept
+        parts["training"].pop("target_rate")
     held: dict[str, Any] = _run.to_jsonable(parts)
     return held
 

@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fusion.gating import Normalizer, normalize
 
 __all__ = ["MapGate", "RpnHead", "SecondHead"]
+
+_LEAK = 0.1
 
 
 class RpnHead(nn.Module):
@@ -42,11 +45,13 @@ class RpnHead(nn.Module):
 class MapGate(nn.Module):
     r"""Fusion weights of a frame from the one-channel map of each view.
 
-    .. math:: w = N\Big(W_o \, \mathrm{relu}\big(\textstyle\sum_k W_k p_k + b_k\big) + b_o\Big)
+    .. math:: w = N\Big(W_o \, \mathrm{lrelu}\big(\textstyle\sum_k W_k p_k + b_k\big) + b_o\Big)
 
     :math:`p_k` are mean and standard deviation over the map of view k after two strided
-    convolutions, :math:`N` the normalizer. `init_detector` starts the last layer at zero, that is
-    from equal weights, as AVOD fuses.
+    convolutions, :math:`N` the normalizer; rectifiers are leaky, since a gate whose few units have
+    died weighs all frames alike. The gate reads the maps and does not train them: one frame's
+    target is a noisy one. `init_detector` starts the last layer at zero, that is from equal
+    weights, as AVOD fuses.
 
     Source: M. S. Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
     """
@@ -58,15 +63,16 @@ class MapGate(nn.Module):
     def __call__(self, maps: tuple[Array, ...]) -> Float[Array, "b k"]:
         """Weights of the views for every frame."""
         hidden = jnp.zeros((maps[0].shape[0], self.width))
-        for k, x in enumerate(maps):
+        for k, view in enumerate(maps):
+            x = jax.lax.stop_gradient(view)
             for i, features in enumerate((8, 16)):
                 conv = nn.Conv(features, (5, 5), strides=(4, 4), name=f"view{k}_conv{i}")
-                x = nn.relu(conv(x))
+                x = nn.leaky_relu(conv(x), _LEAK)
             spread = jnp.sqrt(x.var(axis=(1, 2)) + 1e-6)
             pooled = jnp.concatenate([x.mean(axis=(1, 2)), spread], axis=-1)
             hidden = hidden + nn.Dense(self.width, name=f"view{k}")(pooled)
         last = nn.Dense(len(maps), name="fusion")
-        return normalize(last(nn.relu(hidden)), self.normalizer)
+        return normalize(last(nn.leaky_relu(hidden, _LEAK)), self.normalizer)
 
 
 class SecondHead(nn.Module):

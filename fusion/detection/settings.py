@@ -86,7 +86,7 @@ class DetectorConfig:
     angle_weight: float = 1.0
     gate_loss: LossConfig = dataclasses.field(default_factory=lambda: LossConfig(uniform_floor=1.0))
     gate_params: LossParams = dataclasses.field(
-        default_factory=lambda: LossParams(alpha=1.0, beta=1.0, tau=0.1, anchor=0.3)
+        default_factory=lambda: LossParams(alpha=1.0, beta=30.0, tau=0.1, anchor=100.0)
     )
     targets: TargetConfig = dataclasses.field(
         default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0))
@@ -149,14 +149,16 @@ def detector_preset(name: str, model: str = "avod_argate") -> DetectorConfig:
             fc_widths=(512, 512),
             gate_width=16,
             dropout=0.1,
+            path_drop=0.3,
             rpn_batch=128,
             candidates=512,
             proposals_train=128,
             proposals=64,
-            second_batch=64,
-            truth_proposals=4,
+            second_batch=128,
+            truth_proposals=16,
             max_detections=32,
             score_threshold=0.02,
+            regression_weight=2.0,
         )
     if name == "tiny":
         return dataclasses.replace(

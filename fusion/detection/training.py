@@ -270,7 +270,7 @@ def training_preset(name: str) -> DetectorTraining:
     presets = {
         "paper": DetectorTraining(),
         "small": DetectorTraining(
-            steps=1200, learning_rate=2e-3, schedule="cosine", l2=1e-5, l2_dense=1e-5
+            steps=2000, learning_rate=2e-3, schedule="cosine", l2=1e-5, l2_dense=1e-5
         ),
         "tiny": DetectorTraining(
             steps=20, learning_rate=3e-3, schedule="cosine", l2=0.0, l2_dense=0.0

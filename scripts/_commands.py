@@ -113,6 +113,11 @@ RULES = (
         "study_detector.py",
         "--preset tiny --seeds 1 --steps 1 --kinds camera_blackout --any-size",
     ),
+    Rule(
+        "study_views.py",
+        "--data runs/kitti --kinds camera_blackout --runs "
+        "runs/detector/kitti_avod_argate_tiny_failures_s0",
+    ),
     Rule("bench_detector.py", "--preset tiny --repeats 1 --gemm 64"),
     Rule("bench_kitti_eval.py", "--frames 2 --repeats 1"),
     # Chapter 4.
@@ -190,6 +195,7 @@ PLACEHOLDERS = {
 AREAS = {
     "detector": (
         "simulate_kitti", "train_detector", "evaluate_kitti", "study_detector", "study_geometry",
+        "study_views",
         "draw_detections", "bench_detector", "bench_kitti_eval",
     ),
     "robots": (

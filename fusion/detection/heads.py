@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -49,8 +48,7 @@ class MapGate(nn.Module):
 
     :math:`p_k` are mean and standard deviation over the map of view k after two strided
     convolutions, :math:`N` the normalizer; rectifiers are leaky, since a gate whose few units have
-    died weighs all frames alike. The gate reads the maps and does not train them: one frame's
-    target is a noisy one. `init_detector` starts the last layer at zero, that is from equal
+    died weighs all frames alike. `init_detector` starts the last layer at zero, that is from equal
     weights, as AVOD fuses.
 
     Source: M. S. Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
@@ -63,8 +61,7 @@ class MapGate(nn.Module):
     def __call__(self, maps: tuple[Array, ...]) -> Float[Array, "b k"]:
         """Weights of the views for every frame."""
         hidden = jnp.zeros((maps[0].shape[0], self.width))
-        for k, view in enumerate(maps):
-            x = jax.lax.stop_gradient(view)
+        for k, x in enumerate(maps):
             for i, features in enumerate((8, 16)):
                 conv = nn.Conv(features, (5, 5), strides=(4, 4), name=f"view{k}_conv{i}")
                 x = nn.leaky_relu(conv(x), _LEAK)

@@ -86,7 +86,7 @@ class DetectorConfig:
     angle_weight: float = 1.0
     gate_loss: LossConfig = dataclasses.field(default_factory=lambda: LossConfig(uniform_floor=1.0))
     gate_params: LossParams = dataclasses.field(
-        default_factory=lambda: LossParams(alpha=1.0, beta=30.0, tau=0.1, anchor=100.0)
+        default_factory=lambda: LossParams(alpha=1.0, beta=10.0, tau=0.1, anchor=30.0)
     )
     targets: TargetConfig = dataclasses.field(
         default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0))

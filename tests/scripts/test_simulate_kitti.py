@@ -14,6 +14,7 @@ from fusion.detection.evaluate import average_precision_cap, evaluate
 from fusion.detection.io import frame_names, read_frame, read_split, write_labels
 from fusion.detection.objects import Objects
 from fusion.detection.planes import height_above
+from fusion.detection.simulator.frames import VISIBILITY_COLUMNS
 from scripts import simulate_kitti
 
 LAYOUTS = [(-3.0, 9.0), (2.0, 15.0), (4.0, 22.0), (-2.0, 30.0), (0.5, 12.0), (1.0, 45.0)]
@@ -56,6 +57,12 @@ def test_folder_is_read_and_evaluated(config: simulate_kitti.Config) -> None:
         labelled = [row for row in table if row["label"] != "-1"]
         assert [row["kind"] for row in labelled] == frame.labels.type.tolist()
         assert {row["kind"] for row in table} <= {"Car", "Pedestrian", "bush", "container"}
+        boxes = np.array([[float(r[c]) for c in VISIBILITY_COLUMNS[8:]] for r in labelled])
+        labels = frame.labels
+        truth = np.column_stack(
+            [labels.location, labels.dimensions[:, [2, 1, 0]], labels.rotation_y]
+        )
+        np.testing.assert_allclose(boxes.reshape(-1, 7), truth, atol=0.011)  # labels have 0.01
     assert record["cars"] == n_cars >= 6 and record["look_alikes"] > 0
     # Labels given back as detections: as good as so few cars can be, at the heights of this image.
     found = [dataclasses.replace(t, score=np.ones(len(t))) for t in truths]

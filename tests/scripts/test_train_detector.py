@@ -219,6 +219,16 @@ def test_runs_of_other_settings_are_not_mixed(root: Path, tmp_path: Path) -> Non
     ):
         with pytest.raises(ValueError, match=f"was trained with {name}"):
             command.check_settings(tmp_path, *command.build(changed, cache))
+    # The gate's settings do not concern a model without one.
+    plain = dataclasses.replace(options, config="avod")
+    held = {"settings": command.resolved(*command.build(plain, cache))}
+    (tmp_path / "result.json").write_text(json.dumps(held))
+    for same in (plain, dataclasses.replace(plain, tau=0.7)):
+        command.check_settings(tmp_path, *command.build(same, cache))
+    with pytest.raises(ValueError, match="was trained with path_drop="):
+        command.check_settings(
+            tmp_path, *command.build(dataclasses.replace(plain, path_drop=0.3), cache)
+        )
     (tmp_path / "result.json").write_text("{}")  # from before settings were written
     command.check_settings(tmp_path, detector, training)
 

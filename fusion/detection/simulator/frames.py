@@ -1,7 +1,7 @@
 """Simulated frames as a KITTI folder, and the draws that make frame i the same in every run.
 
 OUT/training/{image_2,velodyne,calib,label_2,planes}/000000.*
-OUT/training/visibility/000000.csv        what each sensor saw of each object
+OUT/training/visibility/000000.csv        3D boxes of objects and look-alikes, what each sensor saw
 OUT/ImageSets/{train,val,test}.txt
 """
 
@@ -34,7 +34,20 @@ from fusion.detection.simulator.sensors import (
     render,
 )
 
-__all__ = ["SimulatedFrame", "draw_scene", "simulate_frames", "split_layouts", "write_frame"]
+__all__ = [
+    "VISIBILITY_COLUMNS",
+    "SimulatedFrame",
+    "draw_scene",
+    "simulate_frames",
+    "split_layouts",
+    "write_frame",
+]
+
+VISIBILITY_COLUMNS = (
+    "label", "kind", "points", "pixels", "share", "dark_paint", "low_contrast", "night",
+    "x", "y", "z", "length", "width", "height", "rotation_y",
+)  # fmt: skip
+"""Columns of `visibility/*.csv`; boxes as in `label_2`, of look-alikes too."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -141,7 +154,7 @@ def write_frame(folder: Path, frame: SimulatedFrame, calibration: Calibration) -
         Counts of points, labelled objects, cars and look-alikes.
     """
     name = f"{frame.index:06d}"
-    readings, seen = frame.readings, frame.seen
+    readings, seen, scene = frame.readings, frame.seen, frame.scene
     image = np.round(255 * np.asarray(readings.image)).astype(np.uint8)
     points = np.asarray(readings.points)[np.asarray(readings.mask)]
     write_image(folder / "image_2" / f"{name}.png", image)
@@ -152,14 +165,15 @@ def write_frame(folder: Path, frame: SimulatedFrame, calibration: Calibration) -
     table.parent.mkdir(parents=True, exist_ok=True)
     with table.open("w", encoding="ascii", newline="") as file:
         rows = csv.writer(file)
-        rows.writerow(
-            ["label", "kind", "points", "pixels", "share", "dark_paint", "low_contrast", "night"]
-        )
-        for i in range(len(seen.slot)):
+        rows.writerow(VISIBILITY_COLUMNS)
+        for i, slot in enumerate(seen.slot):
+            height, width, length = scene.size[slot]
+            yaw = np.arctan2(scene.turn[slot, 1], scene.turn[slot, 0])
+            box = (*scene.place[slot], length, width, height, yaw)
             rows.writerow(
                 [int(seen.label[i]), seen.kind[i], int(seen.points[i]), f"{seen.pixels[i]:.2f}",
                  f"{seen.share[i]:.3f}", int(seen.dark_paint[i]), int(seen.low_contrast[i]),
-                 int(frame.night)]
+                 int(frame.night), *(f"{value:.4f}" for value in box)]
             )  # fmt: skip
     labels = labels_of(frame.scene, seen, calibration, *image.shape[:2])
     write_labels(folder / "label_2" / f"{name}.txt", labels)

@@ -2,13 +2,18 @@
 
 from __future__ import annotations
 
+from functools import partial
 from pathlib import Path
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from fusion.detection.probes import probe_auroc, read_bodies
+from fusion.detection.detector import init_detector
+from fusion.detection.examples import Inputs
+from fusion.detection.probes import probe_auroc, read_bodies, read_views
 from fusion.detection.settings import detector_preset
 
 CONFIG = detector_preset("tiny")
@@ -50,3 +55,34 @@ def test_bodies_that_both_sensors_see(tmp_path: Path) -> None:
     path.write_text("label,kind\n0,Car\n")
     with pytest.raises(ValueError, match=r"000000\.csv: no column rotation_y; simulate"):
         read_bodies(path, CONFIG)
+
+
+def test_crops_are_those_of_the_boxes() -> None:
+    rows, columns = CONFIG.image_size
+    # A picture whose red is the column and whose green is the row, both from 0 to 1.
+    red = jnp.broadcast_to(jnp.linspace(0, 1, columns)[None], (rows, columns))
+    green = jnp.broadcast_to(jnp.linspace(0, 1, rows)[:, None], (rows, columns))
+    none = jnp.zeros(1)
+    inputs = Inputs(
+        image=jnp.stack([red, green, red], axis=-1),
+        bev=jnp.zeros((*CONFIG.bev.shape, CONFIG.bev.n_slices + 1)),
+        anchors=none, anchor_mask=none, n_occupied=none,
+        p2=jnp.array([[40.0, 0, 48, 0], [0, 40, 16, 0], [0, 0, 1, 0]]),
+        image_size=jnp.array([32.0, 96.0]), plane=none, truth=none, truth_mask=none,
+    )  # fmt: skip
+    boxes = jnp.array([[-3.0, 1.6, 12, 4, 1.6, 1.5, 0.0], [4.0, 1.6, 16, 4, 1.6, 1.5, 1.57]])
+    params, stats = jax.jit(partial(init_detector, config=CONFIG))(jax.random.key(0))
+    read = jax.jit(partial(read_views, config=CONFIG))
+    got = read(params["main"], stats, inputs=inputs, boxes=boxes)
+    pixels = got.pixels.reshape(2, 3, 3, 3)
+    # The middle of a box lies at its centre's projection, to the depth's perspective.
+    u = (40 * boxes[:, 0] / boxes[:, 2] + 48) / 95
+    v = (40 * (boxes[:, 1] - 0.75) / boxes[:, 2] + 16) / 31
+    np.testing.assert_allclose(pixels[:, 1, 1, 0], u, atol=0.03)
+    np.testing.assert_allclose(pixels[:, 1, 1, 1], v, atol=0.03)
+    assert (np.diff(pixels[:, 1, :, 0], axis=1) > 0.02).all()
+    assert got.second.shape == got.first.shape == (2,)
+    assert np.isfinite(got.second).all() and np.ptp(got.camera) > 0
+    # A box is read the same beside any others.
+    alone = read(params["main"], stats, inputs=inputs, boxes=boxes[::-1])
+    np.testing.assert_allclose(alone.second, got.second[::-1], atol=1e-5)

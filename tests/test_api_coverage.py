@@ -26,6 +26,7 @@ INSIDE = {
     "fusion.train.init_state": "fusion.train.make_train",
     "fusion.train.train_step": "fusion.train.make_train",
     "fusion.detection.detector.crop_views": "fusion.detection.fitting.fit_detector",
+    "fusion.detection.gate_objective.class_losses": "fusion.detection.fitting.fit_detector",
     "fusion.detection.objective.detector_loss": "fusion.detection.fitting.fit_detector",
     "fusion.detection.proposals.propose": "fusion.detection.fitting.run_detector",
     "fusion.detection.proposals.view_boxes": "fusion.detection.fitting.run_detector",

@@ -6,6 +6,7 @@ The sensors are in the order (camera, lidar) everywhere. `Detector` is what is u
 
 from __future__ import annotations
 
+import math
 from typing import Any, NamedTuple
 
 import flax.linen as nn
@@ -177,7 +178,7 @@ def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
         )
         params["auxiliary"] = heads["params"]
         params["targets"] = init_targets(target_key, config.targets, 2)
-        params["usual_losses"] = jnp.full(2, jnp.log(2.0))
+        params["usual_losses"] = jnp.full(2, math.log(2.0), jnp.float32)
     return params, variables.get("batch_stats", {})
 
 

@@ -16,7 +16,7 @@ from tests.scripts import sweep_toy
 
 KILLS = 20
 CONFIG = sweep.Config(
-    study=sweep_toy.NAME, options=("delay=0.002",), grid=("a=1:2:30", "b=1,2"), seeds=8,
+    study=sweep_toy.NAME, options=("delay=0.005",), grid=("a=1:2:30", "b=1,2"), seeds=8,
     chunk_size="2", chunk_trials=2, quiet=True,
 )  # fmt: skip
 

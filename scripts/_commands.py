@@ -94,10 +94,6 @@ RULES = (
     Rule("study_argate.py", "--preset quick --models argate_ws"),
     Rule("bench_lattice.py", "--steps 2 --repeats 1"),
     Rule("simulate_kitti.py --picture", "--size tiny"),
-    Rule(
-        "simulate_kitti.py --layouts",
-        "--frames 2 --val 2 --size tiny --out runs/kitti_layouts",
-    ),
     Rule("simulate_kitti.py", "--frames 2 --val 2 --test 2 --size tiny"),
     Rule("study_geometry.py", "--frames 2 --any-size"),
     Rule(

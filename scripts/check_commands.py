@@ -8,7 +8,7 @@ appended. They run in a copy of the repository in a temporary folder, with made-
 simulated KITTI frames, so that the repository and its results/ are not touched. Commands of one
 area share a process, as a notebook would: what is imported and compiled once serves the next. One
 line for each with its time; what is not run says why; the log of a command that fails is shown.
-Exit status 1 when one fails. About five minutes on two cores with a warm compilation cache.
+Exit status 1 when one fails. About nine minutes on two cores, after the test suite has compiled.
 """
 
 from __future__ import annotations

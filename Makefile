@@ -31,7 +31,7 @@ demo: $(VENV)/.run  ## install what a run needs and show the main job, with pict
 	$(BIN)/python scripts/demo.py
 
 report: $(VENV)/.run  ## run a small piece of each chapter and write report/index.html
-	$(BIN)/python scripts/reproduce.py --preset quick
+	$(BIN)/python scripts/studies/reproduce.py --preset quick
 
 test: $(VENV)/.dev  ## install what the tests need and run the default suite (<= 15 min on two cores)
 	@echo "== running the default test suite on $(JOBS) workers"
@@ -41,7 +41,7 @@ slow: $(VENV)/.dev  ## the tests that take minutes each
 	$(BIN)/python -m pytest -m slow
 
 commands: $(VENV)/.dev  ## run every command of README and docs at its smallest size, in a copy
-	$(BIN)/python scripts/check_commands.py --jobs $(JOBS)
+	$(BIN)/python scripts/tools/check_commands.py --jobs $(JOBS)
 
 lint: $(VENV)/.dev  ## ruff: style and errors
 	$(BIN)/ruff check .
@@ -54,7 +54,7 @@ docs: $(VENV)/.dev  ## build the documentation into site/
 	NO_MKDOCS_2_WARNING=1 $(BIN)/mkdocs build --strict --quiet
 
 wheel: $(VENV)/.dev  ## build the wheel and import it from outside the repository
-	$(BIN)/python scripts/check_wheel.py
+	$(BIN)/python scripts/tools/check_wheel.py
 
 check: lint types docs wheel test commands  ## everything that CI runs but the report page
 

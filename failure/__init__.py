@@ -1,32 +1,17 @@
 """Rare-failure search for analog and mixed-signal circuits.
 
 Circuits: `circuits`, and `simulators` for your own. Search: `gp`, `gp_fit`, `acquisition`,
-`embeddings`, `bayesopt`, `turbo`, `baselines`, `runs`. Learned spaces: `revnet`, `bnn`. How likely:
+`spaces`, `bayesopt`, `turbo`, `baselines`, `runs`. Learned spaces: `revnet`, `bnn`. How likely:
 `rare_events`. Imported by name only, for what they bring along: `failure.rev_argate` (the fusion
 package), `failure.plots` (matplotlib).
 """
 
-from failure import (
-    acquisition,
-    baselines,
-    bayesopt,
-    bnn,
-    circuits,
-    embeddings,
-    gp,
-    gp_fit,
-    optimize,
-    rare_events,
-    revnet,
-    runs,
-    sharing,
-    simulators,
-    thresholds,
-    turbo,
-)
-from failure.bayesopt import SearchConfig, ask, tell
+from failure import bnn, circuits, rare_events, revnet, simulators
+from failure.models import acquisition, gp, gp_fit, optimize
 from failure.rare_events import importance_sampling, monte_carlo, subset_simulation
-from failure.simulators import CommandSimulator, FunctionSimulator
+from failure.search import baselines, bayesopt, runs, sharing, spaces, thresholds, turbo
+from failure.search.bayesopt import SearchConfig, ask, tell
+from failure.simulators.wrappers import CommandSimulator, FunctionSimulator
 
 __all__ = [
     "CommandSimulator",
@@ -38,7 +23,6 @@ __all__ = [
     "bayesopt",
     "bnn",
     "circuits",
-    "embeddings",
     "gp",
     "gp_fit",
     "importance_sampling",
@@ -49,6 +33,7 @@ __all__ = [
     "runs",
     "sharing",
     "simulators",
+    "spaces",
     "subset_simulation",
     "tell",
     "thresholds",

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 from matplotlib.figure import Figure
 
-from failure.bayesopt import best_so_far
+from failure.search.bayesopt import best_so_far
 
 __all__ = ["plot_activity", "plot_shares", "plot_trend"]
 

@@ -13,7 +13,7 @@ import optax
 from jaxtyping import Array, Float, Key
 
 from failure import bnn, revnet
-from failure.embeddings import ReversedFeatures, Task, unit_scale
+from failure.search.spaces import ReversedFeatures, Task, unit_scale
 from fusion.gating import Gate, apply_weights
 from fusion.losses import loss_targets
 from fusion.targets import TargetConfig, apply_targets, init_targets, project_targets
@@ -330,7 +330,7 @@ def make_space(
 
 
 def train_space(config: Any, keys: Any, x: np.ndarray, y: np.ndarray) -> ReversedFeatures:
-    """Spaces of all seeds of a search (:func:`failure.bayesopt.ask`), one program mapped over them.
+    """Spaces of all seeds of a search, one program mapped over them.
 
     Trained in float32; the space comes back in float64, in which the RevNet inverts to 1e-12.
     """

@@ -8,8 +8,8 @@ from fusion import evaluate, failures, lattice, losses
 from fusion.data import Dataset, load, validation_split
 from fusion.encoders import EncoderConfig, conv1d
 from fusion.failures import Protocol, corrupt
-from fusion.fit import Corruption, fit, test_output
 from fusion.gating import normalize, oracle_weights
+from fusion.loop import Corruption, fit, test_output
 from fusion.losses import LossConfig, LossParams, argate_loss
 from fusion.models import MODELS, ModelConfig, export, init, match_parameters, predict
 from fusion.presets import preset

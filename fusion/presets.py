@@ -23,7 +23,8 @@ class Preset(NamedTuple):
 
 
 # Chosen on validation splits (held-out subjects; held-out rows), never on a test set, in short
-# explorations of one seed; `scripts/study_argate.py` is the whole study, see docs/argate.md.
+# explorations of one seed; `scripts/studies/study_argate.py` is the whole study, see
+# docs/argate.md.
 _HAR = Preset(
     ModelConfig(head_widths=(128,), dropout=0.2),
     TrainConfig(epochs=15, batch_size=64, uniform_floor=1.0, label_smoothing=0.05),

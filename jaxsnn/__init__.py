@@ -1,16 +1,15 @@
 """Spiking networks that learn to steer a robot by reward-modulated STDP, and the robot's world.
 
-Kernels: `neurons`, `plasticity`, `window`. Network: `encoding`, `rewards`, `architecture`,
-`baseline`, `network`, `settings`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`. All
-together: `agents`, `trials`, `qlearning`. Imported by name only, for what they bring along:
+Kernels: `neurons`, `plasticity`, `window`. Network: `encoding`, `rewards`, `config`,
+`running_mean`, `network`, `presets`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`.
+All together: `agents`, `trials`, `qlearning`. Imported by name only, for what they bring along:
 `jaxsnn.ppo` and `jaxsnn.navigation` (flax, optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env`
 (brax).
 """
 
 from jaxsnn import (
     agents,
-    architecture,
-    baseline,
+    config,
     encoding,
     geometry,
     maps,
@@ -18,10 +17,11 @@ from jaxsnn import (
     neurons,
     planner,
     plasticity,
+    presets,
     qlearning,
     rewards,
+    running_mean,
     scenarios,
-    settings,
     trials,
     window,
     world,
@@ -30,8 +30,8 @@ from jaxsnn.maps import random_map
 from jaxsnn.network import network_config, network_params
 from jaxsnn.neurons import LIFParams, lif_step
 from jaxsnn.plasticity import STDPParams, apply_reward, stdp_step
+from jaxsnn.presets import network_setting
 from jaxsnn.scenarios import scenario
-from jaxsnn.settings import network_setting
 from jaxsnn.trials import run_experiment, run_trial
 from jaxsnn.window import stdp_window
 
@@ -40,8 +40,7 @@ __all__ = [
     "STDPParams",
     "agents",
     "apply_reward",
-    "architecture",
-    "baseline",
+    "config",
     "encoding",
     "geometry",
     "lif_step",
@@ -53,14 +52,15 @@ __all__ = [
     "neurons",
     "planner",
     "plasticity",
+    "presets",
     "qlearning",
     "random_map",
     "rewards",
     "run_experiment",
     "run_trial",
+    "running_mean",
     "scenario",
     "scenarios",
-    "settings",
     "stdp_step",
     "stdp_window",
     "trials",

@@ -14,7 +14,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxsnn import network
-from jaxsnn.architecture import NetworkConfig, NetworkParams, check_network
+from jaxsnn.config import NetworkConfig, NetworkParams, check_network
 from jaxsnn.encoding import group_rates, poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
 from jaxsnn.rewards import motor_rewards, tempered, terminal_reward

@@ -15,7 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxsnn._checks import require
-from jaxsnn.architecture import (
+from jaxsnn.config import (
     NetworkConfig,
     NetworkParams,
     Weights,
@@ -25,10 +25,10 @@ from jaxsnn.architecture import (
     neuron_signs,
     weight_bounds,
 )
-from jaxsnn.baseline import Baseline, baseline_init, baseline_update
 from jaxsnn.neurons import LIFParams, LIFState, lif_init, lif_step
 from jaxsnn.plasticity import STDPState, apply_reward, check_bounds, stdp_init, stdp_step
 from jaxsnn.rewards import synapse_signs
+from jaxsnn.running_mean import Baseline, baseline_init, baseline_update
 from jaxsnn.window import STDPKernel, stdp_kernel, stdp_window
 
 __all__ = [

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, Int, Key
 from jaxsnn import world
 from jaxsnn._checks import require
 from jaxsnn.agents import Agent, SNNParams, snn_agent
-from jaxsnn.architecture import NetworkConfig
+from jaxsnn.config import NetworkConfig
 
 __all__ = [
     "ARRIVED",

@@ -9,7 +9,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts import render_api
+from snn_fusion_failure.documentation import api as render_api
 from tests._api import functions_named
 
 TESTS = Path(__file__).resolve().parent
@@ -25,18 +25,18 @@ INSIDE = {
     "fusion.train.batch_loss": "fusion.train.make_train",
     "fusion.train.init_state": "fusion.train.make_train",
     "fusion.train.train_step": "fusion.train.make_train",
-    "fusion.detection.detector.crop_views": "fusion.detection.fitting.fit_detector",
-    "fusion.detection.gate_objective.class_losses": "fusion.detection.fitting.fit_detector",
-    "fusion.detection.objective.detector_loss": "fusion.detection.fitting.fit_detector",
-    "fusion.detection.proposals.propose": "fusion.detection.fitting.run_detector",
-    "fusion.detection.proposals.view_boxes": "fusion.detection.fitting.run_detector",
+    "fusion.detection.network.detector.crop_views": "fusion.detection.learning.fitting.fit_detector",
+    "fusion.detection.learning.gate_objective.class_losses": "fusion.detection.learning.fitting.fit_detector",
+    "fusion.detection.learning.objective.detector_loss": "fusion.detection.learning.fitting.fit_detector",
+    "fusion.detection.geometry.proposals.propose": "fusion.detection.learning.fitting.run_detector",
+    "fusion.detection.geometry.proposals.view_boxes": "fusion.detection.learning.fitting.run_detector",
     "fusion.detection.simulator.materials.surfaces": "fusion.detection.simulator.sensors.render",
-    "fusion.detection.training.fail_sensor": "fusion.detection.fitting.fit_detector",
-    "fusion.detection.training.train_step": "fusion.detection.fitting.fit_detector",
-    "fusion.detection.training.training_inputs": "fusion.detection.fitting.fit_detector",
-    "failure.circuits.cycle.until": "failure.circuits.cycle.pwm_cycle",
-    "failure.circuits.cycle.walk": "failure.circuits.cycle.pwm_cycle",
-    "failure.circuits.solve.newton": "failure.circuits.solve.dc",
+    "fusion.detection.learning.training.fail_sensor": "fusion.detection.learning.fitting.fit_detector",
+    "fusion.detection.learning.training.train_step": "fusion.detection.learning.fitting.fit_detector",
+    "fusion.detection.learning.training.training_inputs": "fusion.detection.learning.fitting.fit_detector",
+    "failure.circuits.buck.cycle.until": "failure.circuits.buck.cycle.pwm_cycle",
+    "failure.circuits.buck.cycle.walk": "failure.circuits.buck.cycle.pwm_cycle",
+    "failure.circuits.solver.solve.newton": "failure.circuits.solver.solve.dc",
 }
 # Functions that work on the host: they check, or loop over programs that are compiled inside.
 HOST = {

@@ -7,20 +7,20 @@ import re
 
 import pytest
 
-from scripts import render_api
-from scripts.render_api import Module
+from snn_fusion_failure.documentation import api as render_api
+from snn_fusion_failure.documentation.api import Module
 
 MODULES = [m for package in render_api.PACKAGES for m in render_api.public_modules(package)]
 
 # A function that takes or gives arrays says what it computes by an equation, a shape or a source.
 # Those below take or give trees of parameters, for which the summary says all there is.
 NO_FORMULA = {
-    "fusion.detection.fitting.frame_order": "indices of frames",
-    "fusion.detection.io_geometry.write_plane": "writes a file",
-    "fusion.detection.io_text.parse_number": "reads one number of a file",
-    "fusion.detection.objective.detector_loss": "a sum of terms with docstrings of their own",
-    "fusion.detection.scoring.image_scale": "one factor, named by the summary",
-    "fusion.detection.training.learning_rate": "one number, named by the summary",
+    "fusion.detection.learning.fitting.frame_order": "indices of frames",
+    "fusion.detection.kitti.geometry_files.write_plane": "writes a file",
+    "fusion.detection.kitti.text.parse_number": "reads one number of a file",
+    "fusion.detection.learning.objective.detector_loss": "a sum of terms with docstrings of their own",
+    "fusion.detection.learning.scoring.image_scale": "one factor, named by the summary",
+    "fusion.detection.learning.training.learning_rate": "one number, named by the summary",
     "fusion.lattice.inputs.require_width": "refuses, computes nothing",
     "fusion.models.init": "parameters of the model that the configuration names",
     "fusion.targets.init_targets": "parameters of the lattice networks",

@@ -1,6 +1,6 @@
 """The documentation holds: its examples run, its links lead somewhere, its commands parse.
 
-That the commands run, too, is what scripts/check_commands.py is for.
+That the commands run, too, is what scripts/tools/check_commands.py is for.
 
 A Python block of a tutorial is executed, after those before it on the page. An HTML comment
 `<!-- not run here: why -->` on the line before a block takes it out, where it would take minutes.
@@ -21,8 +21,14 @@ from typing import Any
 import pytest
 import tyro
 
-from scripts import render_api
-from scripts._commands import PAGES, ROOT, commands, page_name, script_commands
+from snn_fusion_failure.documentation import api as render_api
+from snn_fusion_failure.documentation.commands import (
+    PAGES,
+    ROOT,
+    commands,
+    page_name,
+    script_commands,
+)
 
 TUTORIALS = [p for p in PAGES if p.parent.name == "tutorials" and p.name != "index.md"]
 BLOCK = re.compile(r"(<!-- not run here: [^\n]+ -->\n)?```python\n(.*?)```", re.DOTALL)

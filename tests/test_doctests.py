@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from scripts import render_api
+from snn_fusion_failure.documentation import api as render_api
 
 PARSER = doctest.DocTestParser()
 

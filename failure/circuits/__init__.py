@@ -4,9 +4,9 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from failure.circuits.dcdc import make_dcdc
-from failure.circuits.ldo import make_ldo
-from failure.circuits.pfm import make_dcdc_light
+from failure.circuits.buck.converter import make_dcdc
+from failure.circuits.buck.light_load import make_dcdc_light
+from failure.circuits.ldo.regulator import make_ldo
 from failure.circuits.protocol import Circuit, Spec
 
 __all__ = ["CIRCUITS", "Circuit", "Spec", "get", "make_dcdc", "make_dcdc_light", "make_ldo"]

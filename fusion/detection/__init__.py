@@ -5,17 +5,25 @@ pictures are in `fusion.detection.plots`, which is imported on its own. Function
 of their module (`evaluate.evaluate`, `detect.detect`, `nms.nms`) are left there.
 """
 
-from fusion.detection.anchors import AnchorConfig, anchor_grid, cluster_sizes, select_anchors
-from fusion.detection.bev import BevConfig, bev_maps, pad_points
-from fusion.detection.cache import Cache, open_cache, prepare_cache
-from fusion.detection.calibration import Calibration, camera_to_lidar, lidar_to_camera, project
-from fusion.detection.crop import crop_and_resize
-from fusion.detection.detect import to_objects
-from fusion.detection.detector import Detector, count_main_parameters, init_detector
-from fusion.detection.evaluate import Evaluation, average_precision_cap
-from fusion.detection.examples import Example, Inputs, make_example, make_inputs, stack_examples
-from fusion.detection.fitting import DetectorFit, fit_detector, restore_detector, run_detector
-from fusion.detection.io import (
+from fusion.detection.config import DetectorConfig, detector_preset
+from fusion.detection.geometry.anchors import (
+    AnchorConfig,
+    anchor_grid,
+    cluster_sizes,
+    select_anchors,
+)
+from fusion.detection.geometry.bev import BevConfig, bev_maps, pad_points
+from fusion.detection.geometry.overlaps import box3d_iou, ground_iou, image_iou
+from fusion.detection.geometry.planes import PlaneConfig, PlaneFit, fit_plane
+from fusion.detection.geometry.proposals import Detections
+from fusion.detection.kitti.average_precision import Evaluation, average_precision_cap
+from fusion.detection.kitti.calibration import (
+    Calibration,
+    camera_to_lidar,
+    lidar_to_camera,
+    project,
+)
+from fusion.detection.kitti.files import (
     Frame,
     read_calibration,
     read_frame,
@@ -28,14 +36,30 @@ from fusion.detection.io import (
     write_labels,
     write_results,
 )
-from fusion.detection.objects import Objects
-from fusion.detection.overlaps import box3d_iou, ground_iou, image_iou
-from fusion.detection.planes import PlaneConfig, PlaneFit, fit_plane
-from fusion.detection.proposals import Detections
-from fusion.detection.scoring import car_precision, frame_objects, precision_fields, weight_auroc
-from fusion.detection.sensor_failures import camera_failure, lidar_failure
-from fusion.detection.settings import DetectorConfig, detector_preset
-from fusion.detection.training import (
+from fusion.detection.kitti.objects import Objects
+from fusion.detection.learning.cache import Cache, open_cache, prepare_cache
+from fusion.detection.learning.detect import to_objects
+from fusion.detection.learning.examples import (
+    Example,
+    Inputs,
+    make_example,
+    make_inputs,
+    stack_examples,
+)
+from fusion.detection.learning.fitting import (
+    DetectorFit,
+    fit_detector,
+    restore_detector,
+    run_detector,
+)
+from fusion.detection.learning.scoring import (
+    car_precision,
+    frame_objects,
+    precision_fields,
+    weight_auroc,
+)
+from fusion.detection.learning.sensor_failures import camera_failure, lidar_failure
+from fusion.detection.learning.training import (
     SENSOR_FAILURES,
     DetectorState,
     DetectorTraining,
@@ -43,6 +67,8 @@ from fusion.detection.training import (
     train_step,
     training_preset,
 )
+from fusion.detection.network.crop import crop_and_resize
+from fusion.detection.network.detector import Detector, count_main_parameters, init_detector
 
 __all__ = [
     "SENSOR_FAILURES",

@@ -19,18 +19,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Bool, Float
 
-from fusion.detection.calibration import (
+from fusion.detection.geometry.encodings import box_corners
+from fusion.detection.geometry.overlaps import image_iou
+from fusion.detection.geometry.planes import fit_plane, height_above, plane_difference
+from fusion.detection.kitti.calibration import (
     back_project,
     camera_to_lidar,
     in_image,
     lidar_to_camera,
     project,
 )
-from fusion.detection.encodings import box_corners
-from fusion.detection.io import Frame
-from fusion.detection.objects import Objects, select
-from fusion.detection.overlaps import image_iou
-from fusion.detection.planes import fit_plane, height_above, plane_difference
+from fusion.detection.kitti.files import Frame
+from fusion.detection.kitti.objects import Objects, select
 
 __all__ = ["FrameAlignment", "align_frame", "inside_boxes", "projected_boxes"]
 

@@ -9,11 +9,11 @@ import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-from fusion.detection.calibration import lidar_to_camera, project
-from fusion.detection.encodings import box_corners
-from fusion.detection.evaluate import DIFFICULTIES, METRICS, N_POINTS, Evaluation
-from fusion.detection.io import Frame
-from fusion.detection.objects import Objects, select
+from fusion.detection.geometry.encodings import box_corners
+from fusion.detection.kitti.average_precision import DIFFICULTIES, METRICS, N_POINTS, Evaluation
+from fusion.detection.kitti.calibration import lidar_to_camera, project
+from fusion.detection.kitti.files import Frame
+from fusion.detection.kitti.objects import Objects, select
 
 __all__ = ["plot_bird", "plot_detections", "plot_image", "plot_precision", "plot_training"]
 

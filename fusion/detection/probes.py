@@ -23,12 +23,12 @@ from typing import Any, NamedTuple
 import numpy as np
 from jaxtyping import Array, Float
 
-from fusion.detection.crop import crop_and_resize
-from fusion.detection.detector import Detector, crop_views, fuse
-from fusion.detection.encodings import box3d_to_anchor
-from fusion.detection.examples import Inputs
-from fusion.detection.proposals import view_boxes
-from fusion.detection.settings import DetectorConfig
+from fusion.detection.config import DetectorConfig
+from fusion.detection.geometry.encodings import box3d_to_anchor
+from fusion.detection.geometry.proposals import view_boxes
+from fusion.detection.learning.examples import Inputs
+from fusion.detection.network.crop import crop_and_resize
+from fusion.detection.network.detector import Detector, crop_views, fuse
 from fusion.evaluate import auroc
 
 __all__ = ["LOOK_ALIKES", "Bodies", "Reading", "probe_auroc", "read_bodies", "read_views"]

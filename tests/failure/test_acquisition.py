@@ -6,8 +6,8 @@ import numpy as np
 import pytest
 from scipy import special
 
-from failure import acquisition, gp, gp_fit
-from failure.optimize import ball, box, project
+from failure.models import acquisition, gp, gp_fit
+from failure.models.optimize import ball, box, project
 
 
 @pytest.fixture(autouse=True)

@@ -9,14 +9,17 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure import acquisition, bnn, embeddings, gp, gp_fit, optimize, revnet, turbo
-from failure.circuits import cycle, mosfet
+from failure import bnn, revnet
+from failure.circuits.buck import cycle
+from failure.circuits.solver import mosfet
+from failure.models import acquisition, gp, gp_fit, optimize
+from failure.search import spaces, turbo
 from tests._api import Case, check
 
 N, D = 6, 2
 GP = gp.GPConfig()
 BNN = bnn.BNNConfig(hidden=3)
-TASK = embeddings.Task("box", 3.0, 4)
+TASK = spaces.Task("box", 3.0, 4)
 LDO_LIKE = {"polarity": 1.0, "mobility": 0.05, "early": 4e6, "overlap": 3e-10}
 
 
@@ -137,21 +140,21 @@ CASES = [
         "a draw",
     ),
     Case(
-        "embeddings.decode",
-        lambda u: embeddings.decode(
-            embeddings.random_embedding(jax.random.key(0), TASK, 2), embeddings.task_domain(TASK), u
+        "spaces.decode",
+        lambda u: spaces.decode(
+            spaces.random_embedding(jax.random.key(0), TASK, 2), spaces.task_domain(TASK), u
         ),
         lambda rng: (rng.uniform(-0.4, 0.4, 2),),
     ),
     Case(
-        "embeddings.encode",
-        lambda scale, x: embeddings.encode(embeddings.FullSpace(scale), x),
+        "spaces.encode",
+        lambda scale, x: spaces.encode(spaces.FullSpace(scale), x),
         lambda rng: (np.float64(3.5), rng.normal(size=4)),
         (0, 1),
     ),
     Case(
-        "embeddings.initial_design",
-        lambda k: embeddings.initial_design(embeddings.FullSpace(jnp.asarray(6.0)), TASK, k, 3),
+        "spaces.initial_design",
+        lambda k: spaces.initial_design(spaces.FullSpace(jnp.asarray(6.0)), TASK, k, 3),
         lambda rng: (key(rng),),
         (),
         "a draw",

@@ -5,9 +5,9 @@ import jax
 import numpy as np
 import pytest
 
-from failure import bayesopt, runs
-from failure.acquisition import AcquisitionConfig
-from failure.embeddings import Task
+from failure.models.acquisition import AcquisitionConfig
+from failure.search import bayesopt, runs
+from failure.search.spaces import Task
 
 DIM = 4
 ACQ = AcquisitionConfig(n_raw=64, n_restarts=3, max_evals=30)

@@ -11,8 +11,9 @@ from scipy.linalg import expm as scipy_expm
 from scipy.stats import spearmanr
 
 from failure import circuits
-from failure.circuits import dcdc, ngspice
-from failure.circuits.cycle import Stage, expm, pwm_cycle, stage_matrix
+from failure.circuits.buck import converter
+from failure.circuits.buck.cycle import Stage, expm, pwm_cycle, stage_matrix
+from failure.circuits.solver import ngspice
 
 
 @pytest.fixture(scope="module")
@@ -73,7 +74,7 @@ def samples() -> np.ndarray:
 
 def test_interface_and_nominal(samples: np.ndarray) -> None:
     circuit = circuits.get("dcdc")
-    assert circuit.n_dims == 44 and len(dcdc.MOSFETS) == 22
+    assert circuit.n_dims == 44 and len(converter.MOSFETS) == 22
     assert circuit.spec_names == ("output_accuracy", "overshoot")
     assert circuit.parameter_names[1] == ("MA1", "width")
     specs, status = map(np.asarray, circuit.simulate(samples))
@@ -89,8 +90,8 @@ def test_metrics_are_smooth() -> None:
     """A ten times finer grid moves every specification by less than 1 % of its spread."""
     x = np.random.default_rng(3).normal(size=(44, 32))
     with jax.enable_x64(True):
-        coarse, _ = jax.jit(dcdc.solve_dcdc)(jnp.asarray(x))
-        fine, _ = jax.jit(partial(dcdc.solve_dcdc, refine=10, points=40))(jnp.asarray(x))
+        coarse, _ = jax.jit(converter.solve_dcdc)(jnp.asarray(x))
+        fine, _ = jax.jit(partial(converter.solve_dcdc, refine=10, points=40))(jnp.asarray(x))
     move = np.abs(np.asarray(coarse - fine)).max(axis=1)
     assert np.all(move < 0.01 * np.asarray(fine).std(axis=1))
 
@@ -98,7 +99,7 @@ def test_metrics_are_smooth() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not ngspice.available(), reason="ngspice is not installed")
 def test_ranks_agree_with_every_transistor_switching() -> None:
-    circuit = dcdc.make_dcdc("level1")
+    circuit = converter.make_dcdc("level1")
     x = np.random.default_rng(0).normal(size=(24, 44))
     ours, status = map(np.asarray, circuit.simulate(x))
     theirs, their_status = circuit.reference(x, max_step=2e-9)

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure import gp, gp_fit
-from failure.acquisition import log_ei
+from failure.models import gp, gp_fit
+from failure.models.acquisition import log_ei
 
 TOLERANCE = 1e-8
 

@@ -9,8 +9,15 @@ import numpy as np
 import pytest
 
 from failure import circuits
-from failure.circuits.ldo import I_HEAVY, NETLIST, lowest, make_ldo, solve_ldo, time_grid
-from failure.circuits.netlist import Mosfet
+from failure.circuits.ldo.regulator import (
+    I_HEAVY,
+    NETLIST,
+    lowest,
+    make_ldo,
+    solve_ldo,
+    time_grid,
+)
+from failure.circuits.solver.netlist import Mosfet
 
 N = 8
 

@@ -6,9 +6,9 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from failure.circuits.mna import eliminate, nominal_values, residual, source_current, stamps
-from failure.circuits.mosfet import NMOS, ekv
-from failure.circuits.netlist import (
+from failure.circuits.solver.mna import eliminate, nominal_values, residual, source_current, stamps
+from failure.circuits.solver.mosfet import NMOS, ekv
+from failure.circuits.solver.netlist import (
     Capacitor,
     CurrentSource,
     Inductor,
@@ -19,8 +19,8 @@ from failure.circuits.netlist import (
     Switch,
     VoltageSource,
 )
-from failure.circuits.solve import NOT_CONVERGED, dc, grid, transient
-from failure.circuits.system import compile_netlist
+from failure.circuits.solver.solve import NOT_CONVERGED, dc, grid, transient
+from failure.circuits.solver.system import compile_netlist
 
 
 def solve(netlist: Netlist) -> dict[str, float]:

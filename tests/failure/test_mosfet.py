@@ -7,7 +7,7 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from failure.circuits.mosfet import (
+from failure.circuits.solver.mosfet import (
     NMOS,
     SLOPE,
     U_T,

@@ -6,11 +6,11 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
-from failure.circuits import ngspice
-from failure.circuits.ldo import make_ldo
-from failure.circuits.ldo_ngspice import ldo_decks
-from failure.circuits.mna import nominal_values
-from failure.circuits.netlist import (
+from failure.circuits.ldo.reference import ldo_decks
+from failure.circuits.ldo.regulator import make_ldo
+from failure.circuits.solver import ngspice
+from failure.circuits.solver.mna import nominal_values
+from failure.circuits.solver.netlist import (
     Capacitor,
     CurrentSource,
     Inductor,
@@ -20,8 +20,8 @@ from failure.circuits.netlist import (
     Switch,
     VoltageSource,
 )
-from failure.circuits.solve import dc
-from failure.circuits.system import compile_netlist
+from failure.circuits.solver.solve import dc
+from failure.circuits.solver.system import compile_netlist
 
 needs_ngspice = pytest.mark.skipif(not ngspice.available(), reason="ngspice is not installed")
 

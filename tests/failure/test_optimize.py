@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from failure.optimize import ball, bfgs, box, polish, sample
+from failure.models.optimize import ball, bfgs, box, polish, sample
 
 
 @pytest.fixture(autouse=True)

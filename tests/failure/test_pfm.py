@@ -6,9 +6,10 @@ import numpy as np
 import pytest
 
 from failure import circuits
-from failure.circuits import dcdc, ngspice, pfm
-from failure.circuits.mosfet import MosParams
-from failure.circuits.netlist import VoltageSource
+from failure.circuits.buck import converter, light_load
+from failure.circuits.solver import ngspice
+from failure.circuits.solver.mosfet import MosParams
+from failure.circuits.solver.netlist import VoltageSource
 
 
 def by_small_steps(pulse: dict[str, float], v: float, n_pulses: int) -> tuple[float, float, float]:
@@ -24,18 +25,18 @@ def by_small_steps(pulse: dict[str, float], v: float, n_pulses: int) -> tuple[fl
     starts: list[int] = []
 
     def output(i: float, v: float) -> float:
-        return v + dcdc.R_ESR * (i - load)
+        return v + converter.R_ESR * (i - load)
 
     def slopes(i: float, v: float) -> tuple[float, float]:
-        dv = (i - load) / dcdc.CAPACITANCE
+        dv = (i - load) / converter.CAPACITANCE
         if mode == "open":
             return 0.0, dv
         switch, ohms = {
-            "high": (dcdc.V_DD, pulse["r_high"]),
+            "high": (converter.V_DD, pulse["r_high"]),
             "low": (0.0, pulse["r_low"]),
-            "diode": (-pfm.V_DIODE, 0.0),
+            "diode": (-light_load.V_DIODE, 0.0),
         }[mode]
-        return (switch - (ohms + dcdc.R_COIL) * i - output(i, v)) / dcdc.INDUCTANCE, dv
+        return (switch - (ohms + converter.R_COIL) * i - output(i, v)) / converter.INDUCTANCE, dv
 
     while len(starts) <= n_pulses:
         di, dv = slopes(i, v)
@@ -43,7 +44,7 @@ def by_small_steps(pulse: dict[str, float], v: float, n_pulses: int) -> tuple[fl
         i, v, since = i + h * di, v + h * dv, since + h
         curve.append(output(i, v))
         below = mode == "open" and curve[-1] < pulse["v_trip"]
-        empty = mode == "low" and i * pulse["r_low"] < pfm.V_ZERO
+        empty = mode == "low" and i * pulse["r_low"] < light_load.V_ZERO
         if tripped is None and (below or empty):
             tripped = since
         due = tripped is not None and since >= tripped + pulse["delay"]
@@ -70,9 +71,9 @@ def test_cycle_is_the_circuit_in_small_steps() -> None:
     }  # fmt: skip
     mean, ripple, period = by_small_steps(numbers, 1.203, 2)
     with jax.enable_x64(True):
-        pulse = pfm.Pulse(**{k: jnp.full((1,), v) for k, v in numbers.items()})
+        pulse = light_load.Pulse(**{k: jnp.full((1,), v) for k, v in numbers.items()})
         v = jnp.full((1,), 1.203)
-        cycle = jax.jit(pfm.pfm_cycle)
+        cycle = jax.jit(light_load.pfm_cycle)
         for _ in range(2):
             v, ours, peak = cycle(v, pulse)
     # One step of the coil's current is 0.07 mA, of the output 2 uV.
@@ -103,23 +104,27 @@ def test_pwm_specifications_are_their_own_circuit() -> None:
 @pytest.mark.skipif(not ngspice.available(), reason="ngspice is not installed")
 def test_trip_offset_is_that_of_ngspice() -> None:
     rng = np.random.default_rng(4)
-    u = rng.normal(size=(len(pfm.LOOP_MOSFETS), 2, 3))
+    u = rng.normal(size=(len(light_load.LOOP_MOSFETS), 2, 3))
     with jax.enable_x64(True):
-        offset, status = jax.jit(lambda u: pfm.trip_offset(u, model="level1"))(jnp.asarray(u))
-        values = dcdc.variation(pfm._comparator("level1")[0], pfm.LOOP_MOSFETS, jnp.asarray(u))
+        offset, status = jax.jit(lambda u: light_load.trip_offset(u, model="level1"))(
+            jnp.asarray(u)
+        )
+        values = converter.variation(
+            light_load._comparator("level1")[0], light_load.LOOP_MOSFETS, jnp.asarray(u)
+        )
     assert not np.any(np.asarray(status))
     values = jax.tree.map(np.asarray, values)
     assert isinstance(values.mos, MosParams)
-    assert pfm.COMPARATOR.of(VoltageSource)[-1].name == "Vloop"
-    mosfets = pfm.LOOP_MOSFETS
+    assert light_load.COMPARATOR.of(VoltageSource)[-1].name == "Vloop"
+    mosfets = light_load.LOOP_MOSFETS
     width = np.array([[m.width] for m in mosfets]) * (1 + 0.01 * u[:, 1])
     length = np.array([[m.length] for m in mosfets]) * (1 + 0.01 * u[:, 0])
     for k in range(3):
-        lines = ngspice.elements(pfm.COMPARATOR, values, k, geometry=(width, length))
+        lines = ngspice.elements(light_load.COMPARATOR, values, k, geometry=(width, length))
         control = ["op", "let vcomp=v(comp)", "print vcomp"]
         options = "reltol=1e-7 abstol=1e-15 vntol=1e-9 itl1=500"
         found = ngspice.run(ngspice.deck("trip", lines, control, options=options))
-        assert dcdc.V_REF - found["vcomp"] == pytest.approx(float(offset[k]), abs=1e-6)
+        assert converter.V_REF - found["vcomp"] == pytest.approx(float(offset[k]), abs=1e-6)
 
 
 @pytest.mark.slow
@@ -130,7 +135,9 @@ def test_specifications_are_smooth() -> None:
     """
     x = np.random.default_rng(3).normal(size=(44, 32))
     with jax.enable_x64(True):
-        coarse, _ = jax.jit(pfm.solve_dcdc_light)(jnp.asarray(x))
-        fine, _ = jax.jit(lambda x: pfm.solve_dcdc_light(x, refine=10, points=40))(jnp.asarray(x))
+        coarse, _ = jax.jit(light_load.solve_dcdc_light)(jnp.asarray(x))
+        fine, _ = jax.jit(lambda x: light_load.solve_dcdc_light(x, refine=10, points=40))(
+            jnp.asarray(x)
+        )
     move = np.abs(np.asarray(coarse - fine)).max(axis=1)
     assert np.all(move < np.array([0.01, 0.03]) * np.asarray(fine).std(axis=1))

@@ -5,10 +5,11 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure import bayesopt, embeddings, rev_argate, runs
-from failure.acquisition import AcquisitionConfig
+from failure import rev_argate
 from failure.bnn import BNNConfig
-from failure.embeddings import Task
+from failure.models.acquisition import AcquisitionConfig
+from failure.search import bayesopt, runs, spaces
+from failure.search.spaces import Task
 
 DIM = 6
 TASK = Task("box", 3.0, DIM)
@@ -93,7 +94,7 @@ def test_search_trains_on_counted_simulations_and_resumes(tmp_path):
     end = runs.run(search, simulate, folder=tmp_path)
     assert sum(counted) == 2 * 16 and end.y.shape == (2, 16)
     assert end.space_at == 13 and end.u.shape == (2, 16, 3)
-    assert isinstance(end.space, embeddings.ReversedFeatures)
+    assert isinstance(end.space, spaces.ReversedFeatures)
     assert end.space.restoration is not None and end.space.shift.dtype == np.float64
     whole = runs.run(search, specification)
     np.testing.assert_allclose(whole.x, end.x, rtol=1e-9, atol=1e-9)

@@ -5,10 +5,10 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from failure import runs
-from failure.bayesopt import SearchConfig
-from failure.embeddings import Task
-from failure.sharing import side_by_side
+from failure.search import runs
+from failure.search.bayesopt import SearchConfig
+from failure.search.sharing import side_by_side
+from failure.search.spaces import Task
 
 METHODS = ("monte_carlo", "ridge_corner", "gradient_corner")
 

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from failure.simulators import (
+from failure.simulators.wrappers import (
     FAILED,
     GOOD,
     NOT_FINITE,

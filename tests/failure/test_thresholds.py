@@ -2,8 +2,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure.embeddings import Task
-from failure.thresholds import reachable
+from failure.search.spaces import Task
+from failure.search.thresholds import reachable
 
 
 def two_hills(x):

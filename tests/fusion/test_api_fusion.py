@@ -11,7 +11,9 @@ import numpy as np
 import pytest
 
 from fusion import encoders, failures, gating, losses, targets
-from fusion.detection import crop, detection_loss, encodings, nms, overlaps
+from fusion.detection.geometry import encodings, nms, overlaps
+from fusion.detection.learning import detection_loss
+from fusion.detection.network import crop
 from fusion.lattice import (
     categorical,
     deep_lattice,

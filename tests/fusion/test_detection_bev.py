@@ -11,8 +11,8 @@ import numpy as np
 import pytest
 from scipy.ndimage import map_coordinates
 
-from fusion.detection.bev import BevConfig, bev_maps, ground_to_unit, pad_points
-from fusion.detection.crop import crop_and_resize
+from fusion.detection.geometry.bev import BevConfig, bev_maps, ground_to_unit, pad_points
+from fusion.detection.network.crop import crop_and_resize
 
 SMALL = BevConfig(x_range=(-4.0, 4.0), z_range=(0.0, 6.0), cell=0.5)
 PLANE = np.array([0.02, -0.9997, 0.01, 1.6], np.float32)
@@ -119,8 +119,8 @@ def test_ground_box_finds_its_cells() -> None:
 @pytest.mark.data
 @pytest.mark.slow
 def test_full_size_maps_of_a_real_frame(data_dir: Path) -> None:
-    from fusion.detection.calibration import in_image, lidar_to_camera, project
-    from fusion.detection.io import read_frame
+    from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
+    from fusion.detection.kitti.files import read_frame
 
     frame = read_frame(data_dir / "kitti", "000008")
     camera = lidar_to_camera(frame.calibration, frame.points[:, :3])

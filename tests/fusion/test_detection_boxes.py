@@ -11,9 +11,14 @@ import numpy as np
 import pytest
 import shapely
 
-from fusion.detection.anchors import AnchorConfig, anchor_grid, cluster_sizes, select_anchors
-from fusion.detection.bev import BevConfig, pad_points
-from fusion.detection.encodings import (
+from fusion.detection.geometry.anchors import (
+    AnchorConfig,
+    anchor_grid,
+    cluster_sizes,
+    select_anchors,
+)
+from fusion.detection.geometry.bev import BevConfig, pad_points
+from fusion.detection.geometry.encodings import (
     anchor_ground,
     angle_vector,
     box3d_to_anchor,
@@ -26,7 +31,7 @@ from fusion.detection.encodings import (
     project_boxes,
     resolve_heading,
 )
-from fusion.detection.nms import nms, pairwise
+from fusion.detection.geometry.nms import nms, pairwise
 
 PLANE = jnp.array([0.02, -0.9997, 0.01, 1.6])
 
@@ -259,7 +264,7 @@ def test_a_dead_lidar_leaves_anchors_everywhere() -> None:
 
 @pytest.mark.data
 def test_sizes_of_real_cars(data_dir: Path) -> None:
-    from fusion.detection.io import frame_names, read_labels
+    from fusion.detection.kitti.files import frame_names, read_labels
 
     folder = data_dir / "kitti" / "training" / "label_2"
     sizes = []

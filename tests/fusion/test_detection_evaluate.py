@@ -11,9 +11,13 @@ from types import ModuleType
 import numpy as np
 import pytest
 
-from fusion.detection import evaluate as module
-from fusion.detection.evaluate import average_precision_cap, evaluate, recall_thresholds
-from fusion.detection.objects import Objects, concatenate, empty, select
+from fusion.detection.kitti import average_precision as module
+from fusion.detection.kitti.average_precision import (
+    average_precision_cap,
+    evaluate,
+    recall_thresholds,
+)
+from fusion.detection.kitti.objects import Objects, concatenate, empty, select
 
 ROOT = Path(__file__).resolve().parent.parent
 RECORD = json.loads((ROOT / "golden" / "kitti_ap.json").read_text(encoding="utf-8"))

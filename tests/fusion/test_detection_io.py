@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.detection.calibration import (
+from fusion.detection.kitti.calibration import (
     Calibration,
     back_project,
     camera_to_lidar,
@@ -17,7 +17,7 @@ from fusion.detection.calibration import (
     lidar_to_camera,
     project,
 )
-from fusion.detection.io import (
+from fusion.detection.kitti.files import (
     frame_names,
     read_calibration,
     read_frame,
@@ -35,7 +35,7 @@ from fusion.detection.io import (
     write_results,
     write_split,
 )
-from fusion.detection.objects import Objects, concatenate, empty, select
+from fusion.detection.kitti.objects import Objects, concatenate, empty, select
 
 CAR = "Car 0.00 1 1.80 316.11 191.89 461.97 282.37 1.37 1.64 4.40 -4.07 1.78 13.88 1.52"
 CARE = "DontCare -1 -1 -10 503.89 169.71 590.61 190.13 -1 -1 -1 -1000 -1000 -1000 -10"

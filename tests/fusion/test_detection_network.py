@@ -13,30 +13,40 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.detection import fitting
-from fusion.detection.calibration import Calibration
-from fusion.detection.convolution import convolve
-from fusion.detection.detect import to_objects
-from fusion.detection.detection_loss import balanced_class_loss, class_loss, regression_loss
-from fusion.detection.detector import count_main_parameters, fuse, init_detector
-from fusion.detection.encodings import box3d_to_box4c, box_corners, project_boxes
-from fusion.detection.examples import Example, flip, make_example, make_inputs, stack_examples
-from fusion.detection.fitting import fit_detector, frame_order, run_detector
-from fusion.detection.gate_objective import gate_terms, path_losses
-from fusion.detection.group_norm import GROUP_SIZE, group_norm_relu
-from fusion.detection.io import Frame
-from fusion.detection.objects import Objects
-from fusion.detection.proposals import Detections, anchor_boxes, decode_second, final_boxes
-from fusion.detection.sampling import Assignment, Sample, assign, draw
-from fusion.detection.scoring import car_precision, image_scale, weight_auroc
-from fusion.detection.settings import DetectorConfig, detector_preset
-from fusion.detection.training import (
+from fusion.detection.config import DetectorConfig, detector_preset
+from fusion.detection.geometry.encodings import box3d_to_box4c, box_corners, project_boxes
+from fusion.detection.geometry.proposals import Detections, anchor_boxes, decode_second, final_boxes
+from fusion.detection.kitti.calibration import Calibration
+from fusion.detection.kitti.files import Frame
+from fusion.detection.kitti.objects import Objects
+from fusion.detection.learning import fitting
+from fusion.detection.learning.detect import to_objects
+from fusion.detection.learning.detection_loss import (
+    balanced_class_loss,
+    class_loss,
+    regression_loss,
+)
+from fusion.detection.learning.examples import (
+    Example,
+    flip,
+    make_example,
+    make_inputs,
+    stack_examples,
+)
+from fusion.detection.learning.fitting import fit_detector, frame_order, run_detector
+from fusion.detection.learning.gate_objective import gate_terms, path_losses
+from fusion.detection.learning.sampling import Assignment, Sample, assign, draw
+from fusion.detection.learning.scoring import car_precision, image_scale, weight_auroc
+from fusion.detection.learning.training import (
     SENSOR_FAILURES,
     DetectorTraining,
     learning_rate,
     training_preset,
 )
-from fusion.detection.views import TransposedConv
+from fusion.detection.network.convolution import convolve
+from fusion.detection.network.detector import count_main_parameters, fuse, init_detector
+from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
+from fusion.detection.network.views import TransposedConv
 from fusion.targets import check_targets
 
 TINY = detector_preset("tiny")

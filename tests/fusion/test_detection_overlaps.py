@@ -10,7 +10,12 @@ import shapely
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from fusion.detection.overlaps import box3d_iou, ground_iou, image_iou, rotated_intersection
+from fusion.detection.geometry.overlaps import (
+    box3d_iou,
+    ground_iou,
+    image_iou,
+    rotated_intersection,
+)
 
 
 def polygon(box: np.ndarray) -> shapely.Polygon:

@@ -7,16 +7,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.detection.calibration import in_image, lidar_to_camera, project
-from fusion.detection.io import frame_names, read_frame
-from fusion.detection.objects import DONT_CARE
-from fusion.detection.planes import (
+from fusion.detection.geometry.planes import (
     PlaneConfig,
     fit_plane,
     height_above,
     plane_difference,
     plane_y,
 )
+from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
+from fusion.detection.kitti.files import frame_names, read_frame
+from fusion.detection.kitti.objects import DONT_CARE
 
 
 def scan(plane: np.ndarray, seed: int, clutter: float) -> np.ndarray:

@@ -11,10 +11,10 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from fusion.detection.detector import init_detector
-from fusion.detection.examples import Inputs
+from fusion.detection.config import detector_preset
+from fusion.detection.learning.examples import Inputs
+from fusion.detection.network.detector import init_detector
 from fusion.detection.probes import probe_auroc, read_bodies, read_views
-from fusion.detection.settings import detector_preset
 
 CONFIG = detector_preset("tiny")
 HEADER = (

@@ -9,9 +9,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.detection.io import write_labels, write_results
-from fusion.detection.objects import Objects
-from scripts import evaluate_kitti
+from fusion.detection.kitti.files import write_labels, write_results
+from fusion.detection.kitti.objects import Objects
+from snn_fusion_failure.commands import evaluate_kitti
 
 
 @pytest.fixture

@@ -7,8 +7,8 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.detection.hdl64 import ELEVATIONS, beam_of
-from fusion.detection.sensor_failures import (
+from fusion.detection.kitti.hdl64 import ELEVATIONS, beam_of
+from fusion.detection.learning.sensor_failures import (
     CAMERA_FAILURES,
     LIDAR_FAILURES,
     camera_failure,

@@ -10,10 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.detection.calibration import in_image, lidar_to_camera, project
-from fusion.detection.objects import Objects
-from fusion.detection.overlaps import image_iou
-from fusion.detection.planes import height_above
+from fusion.detection.geometry.overlaps import image_iou
+from fusion.detection.geometry.planes import height_above
+from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
+from fusion.detection.kitti.objects import Objects
 from fusion.detection.simulator.frames import SimulatedFrame, simulate_frames, split_layouts
 from fusion.detection.simulator.labels import image_boxes, labels_of, visibility_of
 from fusion.detection.simulator.layouts import (

@@ -15,7 +15,7 @@ from fusion.data.dataset import Scale
 from fusion.encoders import EncoderConfig
 from fusion.evaluate import gate_auroc, split_accuracy
 from fusion.failures import no_failure, random_failing
-from fusion.fit import Corruption, TrainingDiverged, fit, test_output
+from fusion.loop import Corruption, TrainingDiverged, fit, test_output
 from fusion.losses import LossParams
 from fusion.models import ModelConfig, export
 from fusion.presets import preset

@@ -30,8 +30,8 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion.detection.io import read_labels, write_labels, write_results
-from fusion.detection.objects import DONT_CARE, Objects, concatenate, select
+from fusion.detection.kitti.files import read_labels, write_labels, write_results
+from fusion.detection.kitti.objects import DONT_CARE, Objects, concatenate, select
 
 HERE = Path(__file__).resolve().parent
 CLASSES = ("Car", "Pedestrian", "Cyclist")

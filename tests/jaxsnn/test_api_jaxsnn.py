@@ -11,8 +11,7 @@ import pytest
 
 from jaxsnn import (
     agents,
-    architecture,
-    baseline,
+    config,
     encoding,
     geometry,
     navigation,
@@ -22,6 +21,7 @@ from jaxsnn import (
     ppo,
     qlearning,
     rewards,
+    running_mean,
     scenarios,
     trials,
     window,
@@ -31,10 +31,10 @@ from tests._api import Case, check
 
 DT = 1e-3
 PLACE = scenarios.scenario(1)
-SMALL = architecture.network_config(
+SMALL = config.network_config(
     "S4", group_exc=1, group_inh=1, hidden_exc=4, hidden_inh=4, control_steps=4, hold_steps=4
 )
-CONSTANTS = jax.tree.map(jnp.float32, architecture.network_params(SMALL))
+CONSTANTS = jax.tree.map(jnp.float32, config.network_params(SMALL))
 PAIRS = plasticity.STDPParams()
 TABLE = encoding.rate_table("proposed")
 SPIKES = "spikes are thresholds"
@@ -300,9 +300,9 @@ CASES = [
         (0, 1, 2, 3),
     ),
     Case(
-        "baseline.baseline_update",
-        lambda m, s: baseline.baseline_update(m, s, tau=1.0, duration=0.1),
-        lambda rng: (baseline.Baseline(*f32(rng.random(3), 0.4)), spikes(rng, 3)),
+        "running_mean.baseline_update",
+        lambda m, s: running_mean.baseline_update(m, s, tau=1.0, duration=0.1),
+        lambda rng: (running_mean.Baseline(*f32(rng.random(3), 0.4)), spikes(rng, 3)),
         (0, 1),
     ),
     Case(

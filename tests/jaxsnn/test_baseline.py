@@ -8,10 +8,10 @@ import numpy as np
 import pytest
 
 from jaxsnn import network
-from jaxsnn.architecture import network_config, network_params
-from jaxsnn.baseline import Baseline, baseline_init, baseline_update
+from jaxsnn.config import network_config, network_params
 from jaxsnn.encoding import poisson_spikes
 from jaxsnn.plasticity import STDPParams
+from jaxsnn.running_mean import Baseline, baseline_init, baseline_update
 
 SMALL = network_config("S4", group_exc=4, group_inh=4, hidden_exc=12, hidden_inh=12, hold_steps=20)
 

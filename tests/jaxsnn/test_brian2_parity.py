@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 
 from jaxsnn import network
-from jaxsnn.architecture import NetworkConfig, Weights, network_params, neuron_signs
+from jaxsnn.config import NetworkConfig, Weights, network_params, neuron_signs
 from jaxsnn.plasticity import STDPParams
 
 REFERENCE = Path(__file__).resolve().parent.parent / "reference" / "snn_brian2.py"

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from jaxsnn import network
-from jaxsnn.architecture import (
+from jaxsnn.config import (
     NetworkConfig,
     Weights,
     check_network,

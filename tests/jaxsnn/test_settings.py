@@ -4,10 +4,12 @@ from __future__ import annotations
 
 import pytest
 
-from jaxsnn.architecture import check_network
-from jaxsnn.settings import SETTINGS, network_setting
-from scripts.study_snn import STUDIES
-from scripts.train_snn import metrics, parse_changes, success
+from jaxsnn.config import check_network
+from jaxsnn.presets import SETTINGS, network_setting
+from snn_fusion_failure.commands.train_snn import metrics, parse_changes, success
+from tests._scripts import load_script
+
+STUDIES = load_script("studies/study_snn").STUDIES
 
 
 @pytest.mark.parametrize("setting", sorted(SETTINGS))

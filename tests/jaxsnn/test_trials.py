@@ -9,7 +9,7 @@ import pytest
 
 from jaxsnn import network, scenarios, world
 from jaxsnn.agents import Agent, snn_agent, snn_params, steering_angle
-from jaxsnn.architecture import NetworkConfig, network_params
+from jaxsnn.config import NetworkConfig, network_params
 from jaxsnn.plasticity import STDPParams
 from jaxsnn.trials import (
     ARRIVED,

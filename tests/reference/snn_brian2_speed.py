@@ -4,8 +4,8 @@
 
 210 Poisson inputs, 208 hidden and 2 motor neurons, additive reward-modulated STDP with clocked
 eligibility traces on all synapses; a `network_operation` every control step reads the motors and
-sets rates and reward, as a robot's loop would. `scripts/bench_snn.py --brian2-python` calls this
-file with an interpreter that has brian2 >= 2.9 and numpy < 2.3.
+sets rates and reward, as a robot's loop would. `scripts/benchmarks/bench_snn.py --brian2-python`
+calls this file with an interpreter that has brian2 >= 2.9 and numpy < 2.3.
 """
 
 from __future__ import annotations

@@ -15,8 +15,8 @@ from pathlib import Path
 import jax
 import numpy as np
 
-from fusion.detection.calibration import Calibration
-from fusion.detection.io import (
+from fusion.detection.kitti.calibration import Calibration
+from fusion.detection.kitti.files import (
     write_calibration,
     write_image,
     write_labels,

@@ -6,8 +6,8 @@ import dataclasses
 
 import numpy as np
 
-from fusion.detection.calibration import Calibration
-from fusion.detection.objects import Objects
+from fusion.detection.kitti.calibration import Calibration
+from fusion.detection.kitti.objects import Objects
 from fusion.detection.simulator.scene import KINDS, LABELLED, Scene
 from fusion.detection.simulator.sensors import Readings
 

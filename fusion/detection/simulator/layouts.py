@@ -17,9 +17,9 @@ from pathlib import Path
 
 import numpy as np
 
-from fusion.detection.io import frame_names, read_labels
-from fusion.detection.objects import DONT_CARE, KITTI_TYPES, NO_BOX3D
-from fusion.detection.overlaps import rotated_intersection
+from fusion.detection.geometry.overlaps import rotated_intersection
+from fusion.detection.kitti.files import frame_names, read_labels
+from fusion.detection.kitti.objects import DONT_CARE, KITTI_TYPES, NO_BOX3D
 
 __all__ = ["Layout", "compose", "generated_layout", "keep_apart", "read_layouts"]
 

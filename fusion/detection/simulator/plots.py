@@ -9,9 +9,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Polygon, Rectangle
 
-from fusion.detection.calibration import lidar_to_camera
-from fusion.detection.io import Frame
-from fusion.detection.objects import DONT_CARE, Objects
+from fusion.detection.kitti.calibration import lidar_to_camera
+from fusion.detection.kitti.files import Frame
+from fusion.detection.kitti.objects import DONT_CARE, Objects
 
 __all__ = ["ground_corners", "plot_frames"]
 

@@ -13,8 +13,8 @@ from typing import NamedTuple
 
 import numpy as np
 
-from fusion.detection.overlaps import rotated_intersection
-from fusion.detection.planes import plane_y
+from fusion.detection.geometry.overlaps import rotated_intersection
+from fusion.detection.geometry.planes import plane_y
 from fusion.detection.simulator.layouts import Layout
 
 __all__ = ["KINDS", "LABELLED", "Scene", "SceneConfig", "build_scene"]

@@ -26,8 +26,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Key, PRNGKeyArray
 
-from fusion.detection.calibration import Calibration, camera_to_lidar, lidar_to_camera
-from fusion.detection.hdl64 import AZIMUTH_STEP, ELEVATIONS, RANGE_NOISE
+from fusion.detection.kitti.calibration import Calibration, camera_to_lidar, lidar_to_camera
+from fusion.detection.kitti.hdl64 import AZIMUTH_STEP, ELEVATIONS, RANGE_NOISE
 from fusion.detection.simulator.materials import surfaces
 from fusion.detection.simulator.raycast import cast
 from fusion.detection.simulator.scene import Scene

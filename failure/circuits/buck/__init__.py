@@ -1,0 +1,3 @@
+"""The buck converter, at heavy and at light load."""
+
+__all__: list[str] = []

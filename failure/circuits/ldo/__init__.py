@@ -1,0 +1,3 @@
+"""The low-dropout regulator."""
+
+__all__: list[str] = []

@@ -1,0 +1,3 @@
+"""The batched circuit solver: netlists, device models, modified nodal analysis, transient."""
+
+__all__: list[str] = []

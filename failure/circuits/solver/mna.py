@@ -1,0 +1,335 @@
+"""Modified nodal analysis: the batched residual of a compiled netlist and its sparse Jacobian.
+
+The batch is the last axis of every array. The Jacobian is
+a dictionary of its structurally nonzero entries, each `[batch]`; elimination runs without pivoting
+in minimum-degree order and is unrolled when it is traced, so that XLA sees straight-line code.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import NamedTuple
+
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from failure.circuits.solver.mosfet import MosParams, drain_current, mos_params
+from failure.circuits.solver.netlist import (
+    GROUND,
+    Capacitor,
+    CurrentSource,
+    Inductor,
+    Load,
+    Mosfet,
+    Resistor,
+    Switch,
+    VoltageSource,
+)
+from failure.circuits.solver.system import System, branches, pattern
+
+__all__ = [
+    "GMIN",
+    "Stamps",
+    "Values",
+    "eliminate",
+    "nominal_values",
+    "residual",
+    "source_current",
+    "stamps",
+]
+
+GMIN = 1e-12
+"""Conductance from every unknown node to ground [S]."""
+
+Entries = dict[tuple[int, int], Array]
+
+
+class Values(NamedTuple):
+    """Element values; leaves `[n_elements_of_that_kind, batch]`, or `[..., 1]` when common."""
+
+    mos: MosParams
+    ohms: Float[Array, "r b"]
+    farads: Float[Array, "c b"]
+    henries: Float[Array, "l b"]
+    volts: Float[Array, "v b"]
+    amps: Float[Array, "i b"]
+    load: Float[Array, "o b"]
+    control: Float[Array, "s b"]
+
+
+def nominal_values(system: System) -> Values:
+    """Values of the netlist as drawn, leaves `[n, 1]`, float64 inside `jax.enable_x64`."""
+
+    def column(kind: type, attribute: str) -> Array:
+        return jnp.array([getattr(e, attribute) for e in system.netlist.of(kind)]).reshape(-1, 1)
+
+    def process(attribute: str) -> Array:
+        return jnp.array(
+            [getattr(e.process, attribute) for e in system.netlist.of(Mosfet)]
+        ).reshape(-1, 1)
+
+    mos = mos_params(
+        process("polarity"),
+        process("mobility"),
+        process("early"),
+        process("overlap"),
+        width=column(Mosfet, "width"),
+        length=column(Mosfet, "length"),
+        vto=process("vto"),
+        tox=process("tox"),
+    )
+    return Values(
+        mos=mos,
+        ohms=column(Resistor, "ohms"),
+        farads=column(Capacitor, "farads"),
+        henries=column(Inductor, "henries"),
+        volts=column(VoltageSource, "volts"),
+        amps=column(CurrentSource, "amps"),
+        load=column(Load, "amps"),
+        control=column(Switch, "control"),
+    )
+
+
+class Stamps(NamedTuple):
+    """The part of the equations that Newton does not change; the batch is last.
+
+    `linear` holds the entries `(i, j)` of `keys`, `const` the constant current of each row.
+    """
+
+    linear: Float[Array, "nnz b"]
+    const: Float[Array, "n b"]
+    known: Float[Array, "k b"]
+    mos: MosParams
+    load: Float[Array, "o b"]
+
+
+def _add(entries: Entries, i: int, j: int, value: Array) -> None:
+    entries[i, j] = entries[i, j] + value if (i, j) in entries else value
+
+
+def _pair(entries: Entries, system: System, p: str, n: str, g: Array) -> None:
+    """Stamp a conductance between two nodes, rows of known nodes left out."""
+    i, j = system.index(p), system.index(n)
+    for row, column, sign in ((i, i, 1.0), (i, j, -1.0), (j, j, 1.0), (j, i, -1.0)):
+        if row < system.n:
+            _add(entries, row, column, sign * g)
+
+
+def known_voltages(system: System, values: Values, batch: int) -> Float[Array, "k b"]:
+    """Voltages of the fixed nodes and of ground."""
+    rows = [jnp.broadcast_to(values.volts[k], (batch,)) for k in system.fixed_by.values()]
+    return jnp.stack([*rows, jnp.zeros_like(rows[0]) if rows else jnp.zeros(batch)])
+
+
+def capacitance(system: System, values: Values) -> Entries:
+    """Capacitance matrix, columns over `[unknowns, known]`."""
+    entries: Entries = {}
+    for k, e in enumerate(system.netlist.of(Capacitor)):
+        _pair(entries, system, e.p, e.n, values.farads[k])
+    for k, m in enumerate(system.netlist.of(Mosfet)):
+        _pair(entries, system, m.gate, m.source, values.mos.cgs[k])
+        _pair(entries, system, m.gate, m.drain, values.mos.cgd[k])
+    return entries
+
+
+def conductance(system: System, values: Values) -> tuple[Entries, dict[int, Array]]:
+    """Linear conductances and branch equations, and the constant term of each row."""
+    entries: Entries = {}
+    const: dict[int, Array] = {}
+    one = jnp.ones((batch_size(values),), values.volts.dtype)
+    for i in range(system.n_nodes):
+        _add(entries, i, i, GMIN * one)
+    for k, r in enumerate(system.netlist.of(Resistor)):
+        _pair(entries, system, r.p, r.n, 1.0 / values.ohms[k])
+    for k, s in enumerate(system.netlist.of(Switch)):
+        on, off = float(np.log(1.0 / s.ohms_on)), float(np.log(1.0 / s.ohms_off))
+        _pair(entries, system, s.p, s.n, jnp.exp(off + (on - off) * values.control[k]))
+    for k, c in enumerate(system.netlist.of(CurrentSource)):
+        for node, sign in ((c.p, 1.0), (c.n, -1.0)):
+            i = system.index(node)
+            if i < system.n:
+                const[i] = const.get(i, 0.0 * one) + sign * values.amps[k]
+    sources = system.netlist.of(VoltageSource)
+    for b in branches(system.netlist):
+        row = system.index(f"{b.name}#branch")
+        for node, sign in ((b.p, 1.0), (b.n, -1.0)):
+            i = system.index(node)
+            if i < system.n:
+                _add(entries, i, row, sign * one)
+            _add(entries, row, i, sign * one)
+        if isinstance(b, VoltageSource):
+            const[row] = -values.volts[sources.index(b)]
+    return entries, const
+
+
+def keys(system: System) -> list[tuple[int, int]]:
+    """Order in which `Stamps.linear` lists the entries among unknowns."""
+    found = {k for k in pattern(system) if k[1] < system.n}
+    found |= {(i, i) for i in range(system.n)}
+    return sorted(found)
+
+
+def stamps(system: System, values: Values) -> Stamps:
+    """DC equations of a batch: capacitors open, inductors short.
+
+    Args:
+        system: compiled netlist.
+        values: element values, at least one leaf with the full batch.
+    Returns:
+        Stamps.
+    """
+    batch = batch_size(values)
+    entries, const = conductance(system, values)
+    known = known_voltages(system, values, batch)
+    return assemble(system, values, entries, const, known, batch)
+
+
+def assemble(
+    system: System,
+    values: Values,
+    entries: Entries,
+    const: Mapping[int, Array],
+    known: Float[Array, "k b"],
+    batch: int,
+) -> Stamps:
+    """Split entries into the matrix among unknowns and the constant term."""
+    zero = jnp.zeros((batch,), known.dtype)
+    rows = [const.get(i, zero) + zero for i in range(system.n)]
+    for (i, j), value in entries.items():
+        if j >= system.n and j != system.n + len(system.known) - 1:
+            rows[i] = rows[i] + value * known[j - system.n]
+    linear = [entries.get(k, zero) + zero for k in keys(system)]
+    return Stamps(jnp.stack(linear), jnp.stack(rows), known, values.mos, values.load)
+
+
+def batch_size(values: Values) -> int:
+    """The common length of the last axis."""
+    leaves = [*values.mos, *values[1:]]
+    return max(leaf.shape[-1] for leaf in leaves if leaf.shape[0])
+
+
+def residual(
+    system: System, v: Float[Array, "n b"], s: Stamps
+) -> tuple[Float[Array, "n b"], Entries]:
+    """Sum of the currents that leave each node, and its Jacobian.
+
+    Args:
+        system: compiled netlist.
+        v: unknowns.
+        s: Stamps.
+    Returns:
+        (F `[n, b]`, entries `(i, j) -> [b]`).
+    """
+    full = jnp.concatenate([v, s.known])
+    rows = [s.const[i] for i in range(system.n)]
+    entries: Entries = {}
+    for k, (i, j) in enumerate(keys(system)):
+        entries[i, j] = s.linear[k]
+        rows[i] = rows[i] + s.linear[k] * v[j]
+
+    def put(i: int, current: Array) -> None:
+        if i < system.n:
+            rows[i] = rows[i] + current
+
+    def slope(i: int, j: int, g: Array) -> None:
+        if i < system.n and j < system.n:
+            _add(entries, i, j, g)
+
+    mosfets = system.netlist.of(Mosfet)
+    if mosfets:
+        d, g, t = (
+            np.array([system.index(getattr(m, a)) for m in mosfets])
+            for a in ("drain", "gate", "source")
+        )
+        current, gm, gds = drain_current(system.model, full[d], full[g], full[t], s.mos)
+        for k in range(len(mosfets)):
+            i, j, o = int(d[k]), int(g[k]), int(t[k])
+            put(i, current[k])
+            put(o, -current[k])
+            for row, sign in ((i, 1.0), (o, -1.0)):
+                slope(row, j, sign * gm[k])
+                slope(row, i, sign * gds[k])
+                slope(row, o, -sign * (gm[k] + gds[k]))
+    for k, load in enumerate(system.netlist.of(Load)):
+        i, j = system.index(load.p), system.index(load.n)
+        bend = jnp.tanh((full[i] - full[j]) / load.knee)
+        amps = s.load[k]
+        g_load = amps * (1.0 - bend * bend) / load.knee
+        put(i, amps * bend)
+        put(j, -amps * bend)
+        for row, column, sign in ((i, i, 1.0), (i, j, -1.0), (j, j, 1.0), (j, i, -1.0)):
+            slope(row, column, sign * g_load)
+    return jnp.stack(rows), entries
+
+
+def eliminate(system: System, entries: Entries, rhs: Float[Array, "n b"]) -> Float[Array, "n b"]:
+    """Solve the sparse system for one right-hand side, batch last, without pivoting.
+
+    Args:
+        system: gives the order.
+        entries: `(i, j) -> [b]`.
+        rhs: right-hand sides.
+    Returns:
+        Solution `[n, b]`.
+    Deviation: LU with partial pivoting is safer; nodal matrices with gmin on the diagonal do not
+        need it here, and a small pivot shows up as a sample that does not converge.
+    """
+    a = dict(entries)
+    b = [rhs[i] for i in range(system.n)]
+    done: set[int] = set()
+    inverse: dict[int, Array] = {}
+    for p in system.order:
+        done.add(p)
+        below = sorted(i for (i, j) in a if j == p and i not in done)
+        right = sorted(j for (i, j) in a if i == p and j not in done)
+        inverse[p] = 1.0 / a[p, p]
+        for i in below:
+            factor = a[i, p] * inverse[p]
+            for j in right:
+                _add(a, i, j, -factor * a[p, j])
+            b[i] = b[i] - factor * b[p]
+    x: dict[int, Array] = {}
+    position = {p: k for k, p in enumerate(system.order)}
+    for p in reversed(system.order):
+        value = b[p]
+        for j in sorted(j for (i, j) in a if i == p and position[j] > position[p]):
+            value = value - a[p, j] * x[j]
+        x[p] = value * inverse[p]
+    return jnp.stack([x[i] for i in range(system.n)])
+
+
+def source_current(
+    system: System, v: Float[Array, "n b"], values: Values, name: str
+) -> Float[Array, "b"]:
+    """DC current that a grounded voltage source delivers into the circuit [A].
+
+    Raises:
+        ValueError: no such grounded voltage source.
+    """
+    at = {s.name: s.p for s in system.netlist.of(VoltageSource) if s.n == GROUND}
+    if name not in at:
+        raise ValueError(f"no grounded voltage source {name!r}; known: {', '.join(at)}")
+    node = at[name]
+    batch = batch_size(values)
+    full = jnp.concatenate([v, known_voltages(system, values, batch)])
+    total = jnp.zeros((batch,), v.dtype)
+    for k, r in enumerate(system.netlist.of(Resistor)):
+        drop = full[system.index(r.p)] - full[system.index(r.n)]
+        total = total + ((r.p == node) - (r.n == node)) * drop / values.ohms[k]
+    for k, c in enumerate(system.netlist.of(CurrentSource)):
+        total = total + ((c.p == node) - (c.n == node)) * values.amps[k]
+    for b in branches(system.netlist):
+        sign = (b.p == node) - (b.n == node)
+        total = total + sign * full[system.index(f"{b.name}#branch")]
+    for k, load in enumerate(system.netlist.of(Load)):
+        drop = full[system.index(load.p)] - full[system.index(load.n)]
+        sign = (load.p == node) - (load.n == node)
+        total = total + sign * values.load[k] * jnp.tanh(drop / load.knee)
+    for k, m in enumerate(system.netlist.of(Mosfet)):
+        if node in (m.drain, m.source):
+            vd, vg, vs = (full[system.index(t)] for t in (m.drain, m.gate, m.source))
+            params = MosParams(*(leaf[k] for leaf in values.mos))
+            current, _, _ = drain_current(system.model, vd, vg, vs, params)
+            total = total + ((m.drain == node) - (m.source == node)) * current
+    return total

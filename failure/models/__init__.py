@@ -1,0 +1,3 @@
+"""Gaussian processes, acquisition functions and their optimisation."""
+
+__all__: list[str] = []

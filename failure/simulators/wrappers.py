@@ -1,0 +1,266 @@
+"""A user's own simulator behind one protocol: parallel, timed, retried, and never paid twice.
+
+`simulate(x [n, d]) -> (specs [n, m], status [n])`. Wrap a Python function with `FunctionSimulator`
+or a program with `CommandSimulator`; both run samples in parallel worker processes, end a sample
+that exceeds its time limit, try again, and write every finished sample to a cache on disk before
+the next one starts. Status: 0 good, 1 failed, 2 out of time, 3 not finite.
+"""
+
+from __future__ import annotations
+
+import hashlib
+import json
+import multiprocessing
+import os
+import signal
+import subprocess
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any, Protocol
+
+import numpy as np
+
+from failure.simulators.batches import (
+    FAILED,
+    GOOD,
+    NOT_FINITE,
+    STATUS,
+    TIMED_OUT,
+    Batch,
+    Cache,
+)
+
+__all__ = [
+    "FAILED",
+    "GOOD",
+    "NOT_FINITE",
+    "STATUS",
+    "TIMED_OUT",
+    "Cache",
+    "CommandSimulator",
+    "FunctionSimulator",
+    "Simulator",
+]
+
+
+class Simulator(Protocol):
+    """Anything that maps samples to specifications; a circuit's `simulate` is one."""
+
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`x [n, d] -> (specs [n, m], status [n])`."""
+
+
+def _serve(function: Callable[[np.ndarray], Any], pipe: Any) -> None:
+    """Loop of a worker process: a row in, a result out; the first message says it is ready."""
+    pipe.send("ready")
+    while True:
+        try:
+            row = pipe.recv()
+        except EOFError:
+            return
+        try:
+            pipe.send((np.asarray(function(row), np.float64), GOOD, ""))
+        except Exception as error:
+            pipe.send((None, FAILED, f"{type(error).__name__}: {error}"))
+
+
+_START_LIMIT = 300.0
+"""Longest start of a worker process [s]."""
+
+
+class _Process:
+    """One worker process, started again after it had to be ended."""
+
+    def __init__(self, function: Callable[[np.ndarray], Any]) -> None:
+        self._function = function
+        self._process: Any = None
+
+    def __enter__(self) -> _Process:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        self._stop()
+
+    def _start(self) -> None:
+        # Not fork: the parent has threads of its own (XLA's among them).
+        context = multiprocessing.get_context("spawn")
+        self._pipe, theirs = context.Pipe()
+        self._process = context.Process(target=_serve, args=(self._function, theirs), daemon=True)
+        self._process.start()
+        theirs.close()
+        # The time limit is the simulation's; starting a process and importing has one of its own.
+        try:
+            ready = self._pipe.poll(_START_LIMIT) and self._pipe.recv() == "ready"
+        except EOFError:
+            ready = False
+        if not ready:
+            self._stop()
+            raise ValueError(
+                f"no worker process for {self._function!r}: it must be a top-level function of a "
+                "module that a new process can import"
+            )
+
+    def _stop(self) -> None:
+        if self._process is not None:
+            self._pipe.close()
+            self._process.kill()
+            self._process.join()
+            self._process.close()
+            self._process = None
+
+    def __call__(self, row: np.ndarray, timeout: float) -> tuple[Any, int, str]:
+        if self._process is None:
+            self._start()
+        self._pipe.send(row)
+        try:
+            if self._pipe.poll(timeout):
+                result: tuple[Any, int, str] = self._pipe.recv()
+                return result
+        except EOFError:
+            self._stop()
+            return None, FAILED, "the worker process ended"
+        self._stop()
+        return None, TIMED_OUT, f"no result after {timeout} s"
+
+
+@dataclass
+class FunctionSimulator:
+    """A Python function `f(x [d]) -> m numbers` as a simulator.
+
+    Each of the `workers` is a process of its own, so the function must be importable (a top-level
+    function of a module), and one that hangs is killed after `timeout` seconds. `version` belongs
+    to the cache key: change it when the function changes.
+
+    Raises:
+        ValueError: settings out of range.
+    """
+
+    function: Callable[[np.ndarray], Any]
+    n_specs: int
+    workers: int = 1
+    timeout: float = 60.0
+    retries: int = 1
+    cache: Path | None = None
+    version: str = "1"
+    retry_failed: bool = False
+
+    def __post_init__(self) -> None:
+        name = f"{self.function.__module__}.{self.function.__qualname__}"
+        self._batch = Batch(
+            self.n_specs,
+            self.workers,
+            self.retries,
+            self.timeout,
+            self.cache,
+            self.retry_failed,
+            f"function {name} version {self.version}",
+        )
+
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`x [n, d] -> (specs [n, m], status [n])`; `messages` then tells of each bad row."""
+        return self._batch.run(x, lambda: _Process(self.function))
+
+    @property
+    def messages(self) -> Mapping[int, str]:
+        """Row -> what went wrong, for the last call."""
+        return self._batch.messages
+
+    @property
+    def simulations(self) -> int:
+        """Simulations started so far, retries included, cache hits not."""
+        return self._batch.simulations
+
+
+class _Command:
+    """One attempt is one process of the user's program."""
+
+    def __init__(self, argv: tuple[str, ...]) -> None:
+        self._argv = argv
+
+    def __enter__(self) -> _Command:
+        return self
+
+    def __exit__(self, *exc: object) -> None:
+        pass
+
+    def __call__(self, row: np.ndarray, timeout: float) -> tuple[Any, int, str]:
+        try:
+            process = subprocess.Popen(
+                self._argv,
+                stdin=subprocess.PIPE,
+                stdout=subprocess.PIPE,
+                stderr=subprocess.PIPE,
+                text=True,
+                start_new_session=True,
+            )
+        except OSError as error:
+            raise ValueError(
+                f"cannot start {self._argv[0]!r}: {error}; give the full path of the simulator"
+            ) from error
+        try:
+            out, err = process.communicate(json.dumps(row.tolist()) + "\n", timeout)
+        except subprocess.TimeoutExpired:
+            # Its own session: children that the program has started go with it.
+            os.killpg(process.pid, signal.SIGKILL)
+            process.communicate()
+            return None, TIMED_OUT, f"no result after {timeout} s"
+        if process.returncode != 0:
+            return None, FAILED, f"exit status {process.returncode}: {err.strip()[-300:]}"
+        lines = out.strip().splitlines()
+        try:
+            return json.loads(lines[-1].replace("nan", "NaN")), GOOD, ""
+        except (IndexError, ValueError):
+            return None, FAILED, f"last line of the output is no JSON list: {lines[-1:]}"
+
+
+@dataclass
+class CommandSimulator:
+    """A program as a simulator: `x` as a JSON list on stdin, specifications as one on stdout.
+
+    The last line of stdout counts, so the program may print what it likes before. The cache key is
+    the command, `version`, and the content of the files in `depends` (netlists, model cards).
+
+    Raises:
+        ValueError: settings out of range, or the program cannot be started.
+    """
+
+    argv: Sequence[str]
+    n_specs: int
+    workers: int = 1
+    timeout: float = 60.0
+    retries: int = 1
+    cache: Path | None = None
+    version: str = "1"
+    depends: Sequence[Path] = ()
+    retry_failed: bool = False
+
+    def __post_init__(self) -> None:
+        self.argv = tuple(str(a) for a in self.argv)
+        parts = [f"command {json.dumps(self.argv)} version {self.version}"]
+        for path in self.depends:
+            parts.append(hashlib.sha256(Path(path).read_bytes()).hexdigest())
+        self._batch = Batch(
+            self.n_specs,
+            self.workers,
+            self.retries,
+            self.timeout,
+            self.cache,
+            self.retry_failed,
+            "\n".join(parts),
+        )
+
+    def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        """`x [n, d] -> (specs [n, m], status [n])`; `messages` then tells of each bad row."""
+        argv = tuple(self.argv)
+        return self._batch.run(x, lambda: _Command(argv))
+
+    @property
+    def messages(self) -> Mapping[int, str]:
+        """Row -> what went wrong, for the last call."""
+        return self._batch.messages
+
+    @property
+    def simulations(self) -> int:
+        """Simulations started so far, retries included, cache hits not."""
+        return self._batch.simulations

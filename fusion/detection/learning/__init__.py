@@ -1,0 +1,3 @@
+"""Examples, losses, training, detection and scoring."""
+
+__all__: list[str] = []

@@ -1,0 +1,290 @@
+"""Frames prepared once: examples of fixed size on disk, anchor sizes from the labels, counts.
+
+A cache folder holds `000000.npz` for each frame (of the benchmark's testing part, whose names come
+again, `testing/000000.npz`) and `cache.json` with preset, splits, anchor sizes and what was left
+out.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from fusion.detection.config import CAR_SIZES, DetectorConfig, detector_preset
+from fusion.detection.geometry.anchors import cluster_sizes
+from fusion.detection.kitti.files import frame_names, read_frame, read_labels, read_split
+from fusion.detection.learning.examples import Example, make_example
+
+__all__ = [
+    "TESTING",
+    "Cache",
+    "frame_part",
+    "open_cache",
+    "prepare_cache",
+    "read_example",
+    "split_frames",
+    "write_example",
+]
+
+TESTING = "testing"
+"""The split of all frames in `ROOT/testing`, which have no labels; not a list of `ImageSets`."""
+
+
+def frame_part(split: str) -> str:
+    """The folder below ROOT that a split's frames are in: `training` or `testing`."""
+    return TESTING if split == TESTING else "training"
+
+
+def _example_folder(folder: Path, part: str) -> Path:
+    return folder / TESTING if part == TESTING else folder
+
+
+@dataclasses.dataclass(frozen=True)
+class Cache:
+    """What `cache.json` says.
+
+    Attributes:
+        folder: where the examples are.
+        root: folder of the frames it was made from.
+        preset: of the detector; decides the sizes of all arrays.
+        splits: split name -> frame names.
+        sizes: anchor sizes [m], from the training labels.
+        counts: frames fitted, skipped, missing; points and labels left out.
+    """
+
+    folder: Path
+    root: Path
+    preset: str
+    splits: dict[str, tuple[str, ...]]
+    sizes: tuple[tuple[float, float, float], ...]
+    counts: dict[str, Any]
+
+    def config(self, model: str) -> DetectorConfig:
+        """The preset of the detector with this cache's anchor sizes."""
+        base = detector_preset(self.preset, model)
+        return dataclasses.replace(
+            base, anchors=dataclasses.replace(base.anchors, sizes=self.sizes)
+        )
+
+    def read(self, split: str) -> list[Example]:
+        """All examples of a split, in memory."""
+        return [read_example(self.examples(split), name) for name in self.names(split)]
+
+    def examples(self, split: str) -> Path:
+        """Folder of a split's examples."""
+        return _example_folder(self.folder, frame_part(split))
+
+    def names(self, split: str) -> tuple[str, ...]:
+        """Frames of a split.
+
+        Raises:
+            ValueError: it was not prepared.
+        """
+        if split not in self.splits:
+            raise ValueError(
+                f"{self.folder} has the splits {', '.join(self.splits)}, not {split!r}: run "
+                f"`prepare --add --splits {split}`"
+            )
+        return self.splits[split]
+
+
+def write_example(folder: Path, name: str, example: Example) -> None:
+    """Write one example; a reader sees the whole file or none."""
+    folder.mkdir(parents=True, exist_ok=True)
+    temporary = folder / f".{name}.npz"
+    with temporary.open("wb") as file:
+        arrays: dict[str, Any] = {k: np.asarray(v) for k, v in example._asdict().items()}
+        np.savez(file, **arrays)
+    os.replace(temporary, folder / f"{name}.npz")
+
+
+def read_example(folder: Path, name: str) -> Example:
+    """Read one example. Raises FileNotFoundError when it was not prepared."""
+    path = folder / f"{name}.npz"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: run `prepare` first")
+    with np.load(path) as held:
+        return Example(*(held[field] for field in Example._fields))
+
+
+def split_frames(root: Path, splits: Sequence[str]) -> tuple[dict[str, tuple[str, ...]], int]:
+    """Frames of each split that are on disk, and how many listed ones are not.
+
+    Args:
+        root: KITTI folder.
+        splits: lists of `ImageSets`, or `testing` for all frames of `ROOT/testing`.
+
+    Raises:
+        FileNotFoundError: a list or the image folder is missing.
+        ValueError: none of a list's frames is there, or the list of test frames has training ones.
+    """
+    found: dict[str, tuple[str, ...]] = {}
+    missing = 0
+    for split in splits:
+        folder = root / frame_part(split) / "image_2"
+        images = frame_names(folder, ".png")
+        # All of `testing` there is; a list of it would only repeat the folder.
+        listed = images if split == TESTING else read_split(root / "ImageSets" / f"{split}.txt")
+        present = set(images)
+        found[split] = tuple(name for name in listed if name in present)
+        missing += len(listed) - len(found[split])
+        if not found[split]:
+            where = folder.relative_to(root)
+            if split == TESTING:
+                raise ValueError(f"{root}: no image in {where}")
+            raise ValueError(
+                f"{root}: none of the {len(listed)} frames of ImageSets/{split}.txt has an image "
+                f"in {where}"
+            )
+    train = root / "ImageSets" / "train.txt"
+    if "test" in found and train.is_file():
+        shared = set(found["test"]) & set(read_split(train))
+        if shared:
+            raise ValueError(
+                f"{root}: {len(shared)} frames of ImageSets/test.txt are in train.txt too, such as "
+                f"{min(shared)}: the benchmark's test list names frames of the folder `testing`, "
+                "whose split is called `testing`"
+            )
+    return found, missing
+
+
+def _anchor_sizes(
+    root: Path, names: Sequence[str], n_sizes: int
+) -> tuple[tuple[float, float, float], ...]:
+    sizes = [np.zeros((0, 3))]
+    for name in names:
+        labels = read_labels(root / "training" / "label_2" / f"{name}.txt")
+        cars = (labels.type == "Car") & (labels.dimensions > 0).all(axis=1)
+        sizes.append(labels.dimensions[cars][:, [2, 1, 0]])
+    cars = np.concatenate(sizes)
+    # Clusters of a handful of cars mean nothing; the benchmark's own are the better guess.
+    if len(np.unique(cars, axis=0)) < 20 * n_sizes:
+        return CAR_SIZES[-n_sizes:]
+    centres = np.round(cluster_sizes(cars, n_sizes), 3)
+    return tuple((float(a), float(b), float(c)) for a, b, c in centres)
+
+
+def _read_frames(
+    root: Path,
+    folder: Path,
+    config: DetectorConfig,
+    frames: Sequence[tuple[str, str]],
+    *,
+    any_size: bool,
+    skip_bad: bool,
+    on_frame: Callable[[int, int, str], None] | None,
+) -> dict[str, Any]:
+    """Write the examples of (part, name); returns counts of what was left out."""
+    counts: dict[str, Any] = {
+        "skipped": {}, "plane_fitted": 0, "points_dropped": 0, "labels_dropped": 0,
+    }  # fmt: skip
+    for done, (part, name) in enumerate(frames):
+        try:
+            frame = read_frame(root, name, part=part, any_size=any_size)
+            example, left_out = make_example(frame, config)
+        except (ValueError, FileNotFoundError) as error:
+            if not skip_bad:
+                raise
+            counts["skipped"][_skip_key(part, name)] = str(error)
+            continue
+        for key, value in left_out.items():
+            counts[key] += int(value)
+        write_example(_example_folder(folder, part), name, example)
+        if on_frame is not None:
+            on_frame(done + 1, len(frames), name)
+    return counts
+
+
+def _skip_key(part: str, name: str) -> str:
+    return f"{part}/{name}" if part == TESTING else name
+
+
+def prepare_cache(
+    root: Path,
+    folder: Path,
+    preset: str,
+    *,
+    splits: Sequence[str] = ("train", "val"),
+    add: bool = False,
+    any_size: bool = False,
+    skip_bad: bool = False,
+    on_frame: Callable[[int, int, str], None] | None = None,
+) -> Cache:
+    """Read every frame of the split lists, check it, and write its example.
+
+    Args:
+        root: KITTI folder (`training`, `ImageSets`; `testing` for the split of that name).
+        folder: of the cache.
+        preset: of the detector.
+        splits: lists to read; the first one gives the anchor sizes.
+        add: add the lists to the cache that is there, whose lists and anchor sizes stay.
+        any_size: accept images of other sizes than the benchmark's.
+        skip_bad: leave out frames that cannot be used, and count them, instead of stopping.
+        on_frame: called with (done, all, name).
+
+    Raises:
+        FileNotFoundError: a folder, list or (unless `skip_bad`) a file of a frame is missing; or
+            there is no cache to add to.
+        ValueError: (unless `skip_bad`) a frame is damaged; nothing is left of a split; the cache to
+            add to has another preset or one of the lists; or `testing`, which has no labels, would
+            have to give the anchor sizes.
+    """
+    config = detector_preset(preset)
+    held = open_cache(folder) if add else None
+    if held is not None and (held.preset != preset or set(splits) & set(held.splits)):
+        raise ValueError(
+            f"{folder} has preset {held.preset!r} and the splits {', '.join(held.splits)}: cannot "
+            f"add {', '.join(splits)} of preset {preset!r}; prepare all in another cache folder"
+        )
+    if held is None and splits[0] == TESTING:
+        raise ValueError(
+            f"{folder}: testing frames have no labels to take anchor sizes from: prepare the "
+            "training list first"
+        )
+    found, missing = split_frames(root, splits)
+    everything = sorted({(frame_part(split), name) for split in found for name in found[split]})
+    counts = {"missing": missing} | _read_frames(
+        root, folder, config, everything, any_size=any_size, skip_bad=skip_bad, on_frame=on_frame
+    )
+    kept = {
+        split: tuple(n for n in names if _skip_key(frame_part(split), n) not in counts["skipped"])
+        for split, names in found.items()
+    }
+    for split, names in kept.items():
+        if not names:
+            first = next(iter(counts["skipped"].values()))
+            raise ValueError(f"every frame of the split {split} was skipped; the first: {first}")
+    if held is None:
+        sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes))
+    else:
+        sizes, kept = held.sizes, held.splits | kept
+        skipped = held.counts["skipped"] | counts.pop("skipped")
+        counts = {k: n + held.counts[k] for k, n in counts.items()} | {"skipped": skipped}
+    cache = Cache(folder, root, preset, kept, sizes, counts)
+    record = dataclasses.asdict(cache) | {"folder": str(folder), "root": str(root)}
+    temporary = folder / ".cache.json"
+    temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
+    os.replace(temporary, folder / "cache.json")
+    return cache
+
+
+def open_cache(folder: Path) -> Cache:
+    """Read `cache.json`. Raises FileNotFoundError when there is none."""
+    path = folder / "cache.json"
+    if not path.is_file():
+        raise FileNotFoundError(f"{path} does not exist: run `prepare` first")
+    held = json.loads(path.read_text(encoding="utf-8"))
+    return Cache(
+        folder=folder,
+        root=Path(held["root"]),
+        preset=held["preset"],
+        splits={split: tuple(names) for split, names in held["splits"].items()},
+        sizes=tuple((a, b, c) for a, b, c in held["sizes"]),
+        counts=held["counts"],
+    )

@@ -1,0 +1,93 @@
+"""Detections of trained networks, and their way into KITTI's result format."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fusion.detection.config import DetectorConfig
+from fusion.detection.geometry.encodings import box_corners, project_boxes
+from fusion.detection.geometry.proposals import (
+    Detections,
+    decode_second,
+    final_boxes,
+    propose,
+    view_boxes,
+)
+from fusion.detection.kitti.objects import Objects
+from fusion.detection.learning.examples import Inputs
+from fusion.detection.network.detector import Detector, crop_views, fuse
+
+__all__ = ["detect", "to_objects"]
+
+
+def detect(main: Any, stats: Any, config: DetectorConfig, inputs: Inputs) -> Detections:
+    """Both stages on a batch of frames, inside jit.
+
+    Args:
+        main: `params["main"]`; the auxiliary side and the lattice are not needed.
+        stats: of batch norm.
+        config: static.
+        inputs: batch of frames.
+
+    Returns:
+        `Detections` with a leading axis of frames.
+    """
+    c = config
+    model: Any = Detector(config)
+    variables = {"params": main, "batch_stats": stats}
+    encoded = model.apply(variables, inputs.image, inputs.bev, False, method="encode")
+    scale = 2.0 * encoded.weights
+    locate = jax.vmap(lambda a, p, s: view_boxes(a, p, s, config))
+    places = locate(inputs.anchors, inputs.p2, inputs.image_size)
+    crops = fuse(crop_views(encoded.maps, places, c.rpn_crop), scale)
+    objectness, offsets = model.apply(variables, crops, False, method="first_stage")
+    proposals, found = jax.vmap(lambda a, m, o, d: propose(a, m, o, d, c, c.proposals))(
+        inputs.anchors, inputs.anchor_mask, objectness, offsets
+    )
+    places = locate(proposals, inputs.p2, inputs.image_size)
+    crops = fuse(crop_views(encoded.features, places, c.second_crop), scale)
+    scores, moves, angle = model.apply(variables, crops, False, method="second_stage")
+    boxes = jax.vmap(decode_second)(proposals, moves, angle, inputs.plane)
+    return jax.vmap(lambda b, s, m, w: final_boxes(b, s, m, w, c))(
+        boxes, scores, found, encoded.weights
+    )
+
+
+def to_objects(
+    detections: Detections, p2: np.ndarray, image_size: np.ndarray, name: str = "Car"
+) -> Objects:
+    """Detections of one frame as KITTI objects; those outside the picture are left out.
+
+    Args:
+        detections: of one frame, on the host.
+        p2: `[3, 4]` projection.
+        image_size: rows and columns of the image [pixel].
+        name: their class.
+    """
+    boxes = np.asarray(detections.boxes, np.float32)[np.asarray(detections.mask)]
+    scores = np.asarray(detections.scores, np.float64)[np.asarray(detections.mask)]
+    height, width = (float(v) for v in image_size)
+    corners = box_corners(jnp.asarray(boxes))
+    unit = project_boxes(corners, jnp.asarray(p2, jnp.float32), height, width)
+    pixels = np.asarray(unit, np.float64)[:, [1, 0, 3, 2]]
+    pixels = np.clip(pixels, 0.0, 1.0) * [width - 1, height - 1, width - 1, height - 1]
+    seen = (pixels[:, 2] - pixels[:, 0] > 1.0) & (pixels[:, 3] - pixels[:, 1] > 1.0)
+    seen &= boxes[:, 2] > 0.0
+    boxes, scores, pixels = boxes[seen].astype(np.float64), scores[seen], pixels[seen]
+    n = len(boxes)
+    alpha = boxes[:, 6] - np.arctan2(boxes[:, 0], boxes[:, 2])
+    return Objects(
+        type=np.full(n, name, "<U14"),
+        truncated=np.full(n, -1.0),
+        occluded=np.full(n, -1, np.int64),
+        alpha=np.mod(alpha + np.pi, 2 * np.pi) - np.pi,
+        bbox=pixels,
+        dimensions=boxes[:, [5, 4, 3]],
+        location=boxes[:, :3],
+        rotation_y=boxes[:, 6],
+        score=scores,
+    )

@@ -1,0 +1,233 @@
+"""Frames as arrays of fixed size, and what the networks read: failures, flips, maps, anchors.
+
+`make_example` runs once a frame on the host; `make_inputs` runs inside jit, so that a sensor can
+fail differently each time that the frame is seen.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, PRNGKeyArray
+
+from fusion.detection.config import DetectorConfig
+from fusion.detection.geometry.anchors import anchor_grid, select_anchors
+from fusion.detection.geometry.bev import bev_maps
+from fusion.detection.geometry.planes import fit_plane
+from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
+from fusion.detection.kitti.files import Frame
+
+__all__ = ["Example", "Inputs", "flip", "make_example", "make_inputs", "stack_examples"]
+
+MEAN_RGB = (92.84 / 255, 97.80 / 255, 93.58 / 255)  # of the training images (AVOD)
+
+
+class Example(NamedTuple):
+    """One frame, or with a leading axis a batch, as it is cached.
+
+    Attributes:
+        image: `[h, w, 3]` uint8, resized.
+        points: `[p, 4]` lidar frame, reflectance last; padded; only points seen in the image.
+        point_mask: `[p]`.
+        to_camera: `[3, 4]` lidar to rectified camera.
+        p2: `[3, 4]` projection into the image of the original size.
+        image_size: `[2]` original rows and columns.
+        plane: `[4]` ground plane.
+        truth, truth_mask: `[g, 7]` boxes of the labelled cars in the area, padded.
+    """
+
+    image: np.ndarray | Array
+    points: np.ndarray | Array
+    point_mask: np.ndarray | Array
+    to_camera: np.ndarray | Array
+    p2: np.ndarray | Array
+    image_size: np.ndarray | Array
+    plane: np.ndarray | Array
+    truth: np.ndarray | Array
+    truth_mask: np.ndarray | Array
+
+
+class Inputs(NamedTuple):
+    """What networks and losses read of one frame (or a batch)."""
+
+    image: Array
+    bev: Array
+    anchors: Array
+    anchor_mask: Array
+    n_occupied: Array
+    p2: Array
+    image_size: Array
+    plane: Array
+    truth: Array
+    truth_mask: Array
+
+
+def make_example(frame: Frame, config: DetectorConfig) -> tuple[Example, dict[str, int | bool]]:
+    """Arrays of a frame, and what had to be left out of them.
+
+    Args:
+        frame: as read; without a plane file the ground plane is fitted.
+        config: gives the sizes.
+
+    Returns:
+        The example and counts: `plane_fitted`, `points_dropped` (in the image, over `max_points`),
+        `labels_dropped` (cars over `max_objects`, farthest first).
+
+    Raises:
+        ValueError: no lidar point lies in the image, or no ground plane is found; the message
+            names the frame.
+    """
+    from PIL import Image
+
+    height, width = frame.image.shape[:2]
+    camera = lidar_to_camera(frame.calibration, frame.points[:, :3])
+    plane = frame.plane
+    if plane is None:
+        try:
+            plane = fit_plane(camera).plane
+        except ValueError as error:
+            raise ValueError(f"frame {frame.name}: {error}") from None
+    seen = in_image(*project(frame.calibration, camera), height, width)
+    if not seen.any():
+        raise ValueError(
+            f"frame {frame.name}: none of {len(seen)} lidar points lies in the image: wrong "
+            "calibration, or axes other than x forward, y left, z up?"
+        )
+    x, z = config.bev.x_range, config.bev.z_range
+    # A metre more than the area: a failing lidar moves points.
+    near = (camera[:, 0] > x[0] - 1) & (camera[:, 0] < x[1] + 1)
+    near &= (camera[:, 2] > z[0] - 1) & (camera[:, 2] < z[1] + 1)
+    kept = np.flatnonzero(seen & near)
+    dropped = max(0, len(kept) - config.max_points)
+    if dropped:
+        kept = np.sort(np.random.RandomState(0).permutation(kept)[: config.max_points])
+    points = np.zeros((config.max_points, 4), np.float32)
+    points[: len(kept)] = frame.points[kept]
+
+    truth = np.zeros((config.max_objects, 7), np.float32)
+    n_boxes = lost = 0
+    if frame.labels is not None:
+        labels = frame.labels
+        at_x, at_z = labels.location[:, 0], labels.location[:, 2]
+        # No anchor stands outside the area, and no feature map reaches there.
+        inside = (at_x > x[0]) & (at_x < x[1]) & (at_z > z[0]) & (at_z < z[1])
+        solid = (labels.dimensions > 0).all(axis=1)
+        cars = np.flatnonzero((labels.type == "Car") & solid & inside)
+        cars = cars[np.argsort(labels.location[cars, 2], kind="stable")]
+        lost = max(0, len(cars) - config.max_objects)
+        cars = cars[: config.max_objects]
+        n_boxes = len(cars)
+        truth[:n_boxes, :3] = labels.location[cars]
+        truth[:n_boxes, 3:6] = labels.dimensions[cars][:, [2, 1, 0]]
+        truth[:n_boxes, 6] = labels.rotation_y[cars]
+
+    rows, columns = config.image_size
+    resized = Image.fromarray(frame.image).resize((columns, rows), Image.Resampling.BILINEAR)
+    rect, velo = np.eye(4), np.eye(4)
+    rect[:3, :3], velo[:3] = frame.calibration.r0_rect, frame.calibration.velo_to_cam
+    example = Example(
+        image=np.asarray(resized),
+        points=points,
+        point_mask=np.arange(config.max_points) < len(kept),
+        to_camera=(rect @ velo)[:3].astype(np.float32),
+        p2=frame.calibration.p2.astype(np.float32),
+        image_size=np.array([height, width], np.float32),
+        plane=plane.astype(np.float32),
+        truth=truth,
+        truth_mask=np.arange(config.max_objects) < n_boxes,
+    )
+    counts = {
+        "plane_fitted": frame.plane is None,
+        "points_dropped": dropped,
+        "labels_dropped": lost,
+    }
+    return example, counts
+
+
+def stack_examples(examples: Sequence[Example]) -> Example:
+    """A batch of examples of equal sizes."""
+    return Example(*(np.stack(column) for column in zip(*examples, strict=True)))
+
+
+def flip(
+    image: Float[Array, "h w 3"],
+    points: Float[Array, "p 3"],
+    p2: Float[Array, "3 4"],
+    width: Float[Array, ""],
+    plane: Float[Array, "4"],
+    truth: Float[Array, "g 7"],
+) -> tuple[Array, Array, Array, Array, Array]:
+    """A frame seen in a mirror: x of the camera frame changes sign.
+
+    Returns:
+        image, points, p2, plane, truth; column u becomes width - 1 - u.
+    """
+    mirror = jnp.array([-1.0, 1.0, 1.0])
+    rows = jnp.stack([(width - 1.0) * p2[2] - p2[0], p2[1], p2[2]])
+    new_p2 = rows * jnp.array([[-1.0, 1.0, 1.0, 1.0]])
+    yaw = jnp.mod(jnp.pi - truth[:, 6] + jnp.pi, 2 * jnp.pi) - jnp.pi
+    boxes = truth.at[:, 0].multiply(-1.0).at[:, 6].set(yaw)
+    return (
+        image[:, ::-1],
+        points * mirror[None],
+        new_p2,
+        plane * jnp.array([-1.0, 1.0, 1.0, 1.0]),
+        boxes,
+    )
+
+
+def make_inputs(
+    example: Example,
+    config: DetectorConfig,
+    *,
+    image: Float[Array, "h w 3"] | None = None,
+    points: tuple[Float[Array, "p 4"], Bool[Array, "p"]] | None = None,
+    mirror: Bool[Array, ""] | None = None,
+    key: PRNGKeyArray | None = None,
+    colour_sd: float = 0.0,
+) -> Inputs:
+    """Maps and anchors of one frame, inside jit.
+
+    Args:
+        example: one frame.
+        config: static.
+        image, points: readings that replace the example's, such as those of a failed sensor; the
+            image in [0, 1].
+        mirror: flip the frame.
+        key, colour_sd: shift of the colour channels in training, standard deviation in [0, 1].
+    """
+    if image is None:
+        image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
+    cloud, mask = points if points is not None else (example.points, example.point_mask)
+    to_camera = jnp.asarray(example.to_camera)
+    camera = jnp.asarray(cloud)[:, :3] @ to_camera[:, :3].T + to_camera[:, 3][None]
+    p2, plane, truth = (jnp.asarray(a) for a in (example.p2, example.plane, example.truth))
+    size = jnp.asarray(example.image_size)
+    if mirror is not None:
+        plain = image, camera, p2, plane, truth
+        flipped = flip(image, camera, p2, size[1], plane, truth)
+        image, camera, p2, plane, truth = jax.tree.map(
+            lambda a, b: jnp.where(mirror, a, b), flipped, plain
+        )
+    image = image - jnp.array(MEAN_RGB)[None, None]
+    if key is not None and colour_sd > 0:
+        image = image + colour_sd * jax.random.normal(key, (1, 1, 3))
+    mask = jnp.asarray(mask)
+    grid = anchor_grid(plane, config.bev, config.anchors)
+    anchors = select_anchors(grid, camera, mask, plane, config.bev, config.anchors)
+    return Inputs(
+        image=image,
+        bev=bev_maps(camera, mask, plane, config.bev),
+        anchors=anchors.boxes,
+        anchor_mask=anchors.mask,
+        n_occupied=anchors.n_occupied,
+        p2=p2,
+        image_size=size,
+        plane=plane,
+        truth=truth,
+        truth_mask=jnp.asarray(example.truth_mask),
+    )

@@ -1,0 +1,239 @@
+"""The host loops around training and detection: order of frames, checkpoints, resume, reports.
+
+Step i draws its frames and keys from the run's seed and i alone, so a resumed run goes on with the
+same bits, and both models of one seed see the same frames with the same failures.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+
+from fusion.detection.config import DetectorConfig
+from fusion.detection.geometry.proposals import Detections
+from fusion.detection.learning.checkpoints import Checkpoints
+from fusion.detection.learning.detect import detect
+from fusion.detection.learning.examples import Example, Inputs, make_inputs, stack_examples
+from fusion.detection.learning.training import (
+    DetectorState,
+    DetectorTraining,
+    fail_sensor,
+    init_training,
+    train_step,
+)
+from fusion.loop import TrainingDiverged
+
+__all__ = [
+    "DetectorFit",
+    "fit_detector",
+    "frame_order",
+    "restore_detector",
+    "run_detector",
+    "sensor_mask",
+]
+
+
+class DetectorFit(NamedTuple):
+    """The trained state and a row of means every `report_every` steps."""
+
+    state: DetectorState
+    history: list[dict[str, float]]
+
+
+def restore_detector(
+    folder: Path, config: DetectorConfig, train: DetectorTraining
+) -> DetectorState | None:
+    """The newest state of a folder of checkpoints; None when there is none."""
+    if not folder.is_dir():
+        return None
+    checkpoints = Checkpoints(folder)
+    held = checkpoints.restore(_init(config, train)(jax.random.key(0)))
+    checkpoints.close()
+    return None if held is None else held[1]
+
+
+# One compiled program per network serves all seeds and failures of a study.
+@functools.lru_cache(maxsize=8)
+def _step(config: DetectorConfig, train: DetectorTraining) -> Callable[..., Any]:
+    return jax.jit(functools.partial(train_step, config=config, train=train), donate_argnums=0)
+
+
+@functools.lru_cache(maxsize=8)
+def _init(config: DetectorConfig, train: DetectorTraining) -> Callable[..., DetectorState]:
+    # Inside jit the forward pass that flax runs to learn the shapes is dead code and costs nothing.
+    return jax.jit(functools.partial(init_training, config=config, train=train))
+
+
+def frame_order(seed: int, n_frames: int, step: int, batch_size: int) -> np.ndarray:
+    """Frames of a step: every frame once before any comes again, in an order drawn anew."""
+    index = np.arange(step * batch_size, (step + 1) * batch_size)
+    orders: dict[int, np.ndarray] = {}
+    for epoch in set((index // n_frames).tolist()):
+        orders[epoch] = np.random.RandomState([seed, epoch]).permutation(n_frames)
+    return np.array([orders[i // n_frames][i % n_frames] for i in index.tolist()])
+
+
+def _means(rows: Sequence[tuple[Any, Any]]) -> dict[str, float]:
+    terms = [row[0] for row in rows]
+    out = {
+        name: float(np.mean([np.mean(np.asarray(getattr(t, name))) for t in terms]))
+        for name in terms[0]._fields
+        if name != "weights"
+    }
+    weights = np.concatenate([np.asarray(t.weights) for t in terms])
+    failed = np.concatenate([np.asarray(row[1]) for row in rows])
+    out["weight_camera"] = float(weights[:, 0].mean())
+    for k, sensor in enumerate(("camera", "lidar")):
+        if failed[:, k].any():
+            out[f"weight_failed_{sensor}"] = float(weights[failed[:, k], k].mean())
+    return out
+
+
+def fit_detector(
+    seed: int,
+    config: DetectorConfig,
+    train: DetectorTraining,
+    n_frames: int,
+    read: Callable[[int], Example],
+    *,
+    report_every: int = 20,
+    on_report: Callable[[int, dict[str, float]], None] | None = None,
+    checkpoint_dir: Path | None = None,
+    checkpoint_every: int = 500,
+    resume: bool = False,
+) -> DetectorFit:
+    """Train a detector.
+
+    Args:
+        seed: of parameters, order of frames, failures, mini-batches.
+        config, train: static.
+        n_frames, read: number of training frames, and the example of frame i; called in a thread
+            one step ahead.
+        report_every: steps between reports; on_report: called with (steps done, means).
+        checkpoint_dir, checkpoint_every: where to keep checkpoints, steps between them; the last
+            step and an interrupt save too.
+        resume: go on from the newest checkpoint.
+
+    Raises:
+        ValueError: checkpoints are there and `resume` is not set, or there are no frames.
+        TrainingDiverged: the loss is not finite; the checkpoint before it is kept.
+    """
+    if n_frames < 1:
+        raise ValueError("n_frames=0: expected at least one training frame")
+    key = jax.random.key(seed)
+    state = _init(config, train)(jax.random.fold_in(key, 0))
+    start = 0
+    history: list[dict[str, float]] = []
+    checkpoints = None if checkpoint_dir is None else Checkpoints(checkpoint_dir)
+    if checkpoints is not None and (held := checkpoints.restore(state)) is not None:
+        if not resume:
+            raise ValueError(
+                f"{checkpoint_dir} holds checkpoints of another run; resume it, or choose an "
+                "empty folder"
+            )
+        start, state, history = held
+    advance = _step(config, train)
+    step_key = jax.random.fold_in(key, 1)
+
+    def batch(step: int) -> Example:
+        order = frame_order(seed, n_frames, step, train.batch_size)
+        return stack_examples([read(i) for i in order.tolist()])
+
+    done, rows = start, []
+    with ThreadPoolExecutor(1) as reader:
+        ahead = reader.submit(batch, start) if start < train.steps else None
+        try:
+            for step in range(start, train.steps):
+                assert ahead is not None
+                examples = ahead.result()
+                ahead = reader.submit(batch, step + 1) if step + 1 < train.steps else None
+                state, terms, failed = advance(state, jax.random.fold_in(step_key, step), examples)
+                rows.append((terms, failed))
+                done = step + 1
+                if done % report_every and done < train.steps:
+                    continue
+                row = {"step": float(done), **_means(rows)}
+                rows = []
+                if not np.isfinite(row["total"]):
+                    raise TrainingDiverged(
+                        f"the loss is {row['total']} near step {done}; lower the learning rate "
+                        f"({train.learning_rate:g})"
+                    )
+                history.append(row)
+                if on_report is not None:
+                    on_report(done, row)
+                if checkpoints is not None and done % checkpoint_every < report_every:
+                    checkpoints.save(done, state, history)
+        except KeyboardInterrupt:
+            if checkpoints is not None and not rows:
+                checkpoints.save(done, state, history)
+            raise
+    if checkpoints is not None:
+        checkpoints.save(done, state, history)
+        checkpoints.close()
+    return DetectorFit(state, history)
+
+
+@functools.lru_cache(maxsize=32)
+def _inputs(config: DetectorConfig, failure: str | None) -> Callable[..., Inputs]:
+    def run(key: Any, example: Example, severity: Any) -> Inputs:
+        if failure is None:
+            inputs = make_inputs(example, config)
+        else:
+            inputs = fail_sensor(key, example, config, failure, severity)
+        return jax.tree.map(lambda a: a[None], inputs)
+
+    return jax.jit(run)
+
+
+@functools.lru_cache(maxsize=8)
+def _detect(config: DetectorConfig) -> Callable[..., Detections]:
+    return jax.jit(functools.partial(detect, config=config))
+
+
+def run_detector(
+    state: DetectorState,
+    config: DetectorConfig,
+    examples: Sequence[Example],
+    *,
+    failure: str | None = None,
+    severity: float = 1.0,
+    seed: int = 0,
+    on_frame: Callable[[int], None] | None = None,
+) -> list[Detections]:
+    """Detections of every frame, on the host.
+
+    Args:
+        state: trained.
+        config: static.
+        examples: frames.
+        failure: of `SENSOR_FAILURES`, the failure of one sensor in every frame; None for none.
+        severity: of the failure; seed: of its noise, which depends on the frame's position too.
+        on_frame: called with the number of frames done.
+    """
+    # The two models differ in the gate alone, and read the same inputs.
+    read, run = _inputs(dataclasses.replace(config, model="avod"), failure), _detect(config)
+    key = jax.random.key(seed)
+    out = []
+    for i, example in enumerate(examples):
+        inputs = read(jax.random.fold_in(key, i), example, jnp.float32(severity))
+        found = run(state.params["main"], state.stats, inputs=inputs)
+        found = jax.tree.map(lambda a: a[0], found)
+        out.append(jax.device_get(found))
+        if on_frame is not None:
+            on_frame(i + 1)
+    return out
+
+
+def sensor_mask(failure: str | None, n: int) -> np.ndarray:
+    """Which of (camera, lidar) a failure concerns, for n frames `[n, 2]`."""
+    sensor = "" if failure is None else failure.partition("_")[0]
+    return np.tile(np.array([sensor == "camera", sensor == "lidar"]), (n, 1))

@@ -1,0 +1,122 @@
+r"""The gate's part of the detector's loss: paths that read one view alone, and targets from them.
+
+.. math::
+    \alpha \sum_k w_k L^{aux}_k + \beta \sum_k \big(w_k - f_k(\tilde L)\big)^2
+      + \lambda \sum_k \big(f_k(\tilde L) - \mathrm{softmax}(-\tilde L / \tau)_k\big)^2
+
+:math:`L^{aux}_k` is the loss of view k's path through both stages, in whose class losses objects
+and background weigh alike (`balanced_class_loss`). The targets see
+
+.. math:: \tilde L_k = 1 + \ell_k - \bar\ell_k,
+
+with :math:`\ell_k` the mean of these class losses and :math:`\bar\ell_k` what it is on average. The
+whole loss says how many objects a frame holds and how they stand, more than in which state its
+sensor is; and a sensor that alone is the weaker one, however well it works, is no failed sensor.
+
+Source: M. S. Shim (2020), Equation 3.2 and section 3.3.2.2. Deviations: the paths' second stage,
+what the targets see (`DetectorConfig.auxiliary_second`, `balanced_paths`).
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array
+
+from fusion.detection.config import DetectorConfig
+from fusion.detection.learning.detection_loss import (
+    balanced_class_loss,
+    class_loss,
+    regression_loss,
+)
+from fusion.detection.learning.sampling import Sample
+from fusion.losses import argate_loss
+from fusion.targets import apply_targets
+
+__all__ = ["PathLosses", "class_losses", "gate_terms", "path_losses"]
+
+
+class PathLosses(NamedTuple):
+    """Losses of the views' paths in one stage.
+
+    Attributes:
+        whole: `[b, k]` classes, boxes and headings.
+        balanced: `[b, k]` classes, positives and negatives weighted alike.
+        counted: `[b]` 1 for frames with positives, else 0.
+    """
+
+    whole: Array
+    balanced: Array
+    counted: Array
+
+
+def class_losses(scores: Array, sample: Sample, config: DetectorConfig) -> Array:
+    """Class loss of every frame `[b]` from the scores of its mini-batch `[b, m, 2]`."""
+    return jax.vmap(lambda s, m: class_loss(s, m, config.label_smoothing))(scores, sample)
+
+
+def path_losses(
+    outputs: list[tuple[Array, ...]],
+    wanted: tuple[Array, ...],
+    sample: Sample,
+    config: DetectorConfig,
+) -> PathLosses:
+    """Losses of one stage.
+
+    Args:
+        outputs: of each view, class scores `[b, m, 2]`, then offsets, then (second stage) headings.
+        wanted: what offsets and headings should be.
+        sample: mini-batch of every frame.
+        config: weights of the parts.
+    """
+    scales = (config.regression_weight, config.angle_weight)
+    regress = jax.vmap(regression_loss)
+    whole, balanced = [], []
+    for scores, *predicted in outputs:
+        parts = [
+            scale * regress(p, w, sample)
+            for scale, p, w in zip(scales, predicted, wanted, strict=False)
+        ]
+        told = jax.vmap(balanced_class_loss)(scores, sample)
+        classes = told if config.balanced_paths else class_losses(scores, sample, config)
+        whole.append(classes + sum(parts))
+        balanced.append(told)
+    counted = sample.positive.any(axis=1).astype(jnp.float32)
+    return PathLosses(jnp.stack(whole, 1), jnp.stack(balanced, 1), counted)
+
+
+def gate_terms(
+    params: Any, config: DetectorConfig, weights: Array, stages: list[PathLosses]
+) -> tuple[Array, Array, Array]:
+    """The gate's part of the loss, its auxiliary and its regularization term; scalars.
+
+    Args:
+        params: of `init_detector`, for the lattice and the usual losses.
+        config: static.
+        weights: `[b, k]` fusion weights.
+        stages: losses of each stage.
+    """
+    options = dataclasses.replace(config.gate_loss, normalizer=config.normalizer)
+    aux_losses = sum((stage.whole for stage in stages[1:]), stages[0].whole)
+    seen, counted, habit = aux_losses, None, jnp.zeros(())
+    if config.balanced_paths:
+        told = jnp.mean(jnp.stack([stage.balanced for stage in stages]), axis=0)
+        counted = jnp.prod(jnp.stack([stage.counted for stage in stages]), axis=0)
+        # The average is learned beside the lattice: it minimizes the squared distance.
+        usual, now = params["usual_losses"][None], jax.lax.stop_gradient(told)
+        habit = jnp.mean(counted * 0.5 * jnp.sum((usual - now) ** 2, axis=-1))
+        seen = 1.0 + told - jax.lax.stop_gradient(usual)
+    seen = jax.lax.stop_gradient(seen) if options.stop_targets else seen
+    targets = None
+    if options.learned_targets:
+        targets = apply_targets(params["targets"], config.targets, seen)
+    # The cross entropy of a single class is zero: what is left are the terms of the gate.
+    none = jnp.zeros((weights.shape[0], 1))
+    labels = jnp.zeros(weights.shape[0], jnp.int32)
+    terms = argate_loss(
+        options, config.gate_params, none, labels, weights, aux_losses, targets, seen, counted
+    )
+    return terms.total + habit, terms.auxiliary, terms.regularization

@@ -1,0 +1,91 @@
+"""Average precision of a detector's output, and how its fusion weights tell which sensor failed."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from jaxtyping import Float
+
+from fusion.detection.geometry.proposals import Detections
+from fusion.detection.kitti.average_precision import DIFFICULTIES, METRICS, Evaluation, evaluate
+from fusion.detection.kitti.objects import Objects
+from fusion.detection.learning.detect import to_objects
+from fusion.detection.learning.examples import Example
+from fusion.evaluate import auroc
+
+__all__ = ["car_precision", "frame_objects", "image_scale", "precision_fields", "weight_auroc"]
+
+_KITTI_WIDTH, _NARROWEST = 1242.0, 1000.0
+
+
+def image_scale(width: float) -> float:
+    """Factor from pixels of this image to pixels of the benchmark.
+
+    The limits of easy, moderate and hard are 40 and 25 pixels of a picture 1242 pixels wide. The
+    same road in a picture a quarter as wide has to be measured in the same pixels, or hardly a car
+    would count. Pictures of the benchmark's own sizes are left as they are.
+    """
+    return 1.0 if width >= _NARROWEST else _KITTI_WIDTH / width
+
+
+def frame_objects(detections: Sequence[Detections], examples: Sequence[Example]) -> list[Objects]:
+    """Detections of each frame in KITTI's terms, in pixels of the frame's own image."""
+    return [
+        to_objects(found, np.asarray(example.p2), np.asarray(example.image_size))
+        for found, example in zip(detections, examples, strict=True)
+    ]
+
+
+def _scaled(objects: Objects, factor: float) -> Objects:
+    return dataclasses.replace(objects, bbox=objects.bbox * factor)
+
+
+def car_precision(
+    labels: Sequence[Objects],
+    detections: Sequence[Objects],
+    widths: Sequence[float],
+    *,
+    min_overlap: float = 0.7,
+) -> Evaluation:
+    """Precision curves of cars, in pixels of the benchmark.
+
+    Args:
+        labels, detections: of the same frames.
+        widths: width of each frame's image [pixel], see `image_scale`.
+        min_overlap: in 2D, on the ground and in 3D; the benchmark's is 0.7.
+
+    Raises:
+        ValueError: like `fusion.detection.kitti.average_precision.evaluate`.
+    """
+    scales = [image_scale(width) for width in widths]
+    return evaluate(
+        [_scaled(o, s) for o, s in zip(labels, scales, strict=True)],
+        [_scaled(o, s) for o, s in zip(detections, scales, strict=True)],
+        classes=("Car",),
+        min_overlap={"Car": min_overlap},
+    )
+
+
+def precision_fields(evaluation: Evaluation) -> dict[str, float]:
+    """Average precision [%] of cars: `3d_moderate_r40` and so on, all metrics and difficulties."""
+    out = {}
+    for points in (11, 40):
+        table = evaluation.average_precision(points)[0]
+        for m, metric in enumerate(METRICS):
+            for d, difficulty in enumerate(DIFFICULTIES):
+                out[f"{metric}_{difficulty}_r{points}"] = float(table[m, d])
+    return out
+
+
+def weight_auroc(
+    clean: Float[np.ndarray, "n 2"], failed: Float[np.ndarray, "n 2"], sensor: int
+) -> float:
+    """The chance that a sensor's weight is lower in a frame where it fails than in a clean one.
+
+    Args:
+        clean, failed: fusion weights of frames in which all sensors work, and in which one fails.
+        sensor: which one; 0 for the camera, 1 for the lidar.
+    """
+    return auroc(clean[:, sensor], failed[:, sensor])

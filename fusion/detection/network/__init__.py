@@ -1,0 +1,3 @@
+"""The two-stage detector as flax modules."""
+
+__all__: list[str] = []

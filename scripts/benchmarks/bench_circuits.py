@@ -1,0 +1,93 @@
+"""Speed of the circuit solver against one ngspice process per sample, per CPU-second.
+
+    python scripts/benchmarks/bench_circuits.py [--batch 64 --repeats 5 --ngspice-samples 40]
+
+Prints CPU time per sample of the LDO regulator (two operating points and a load step) by the JAX
+solver and by ngspice (level 1, largest step 0.5 ns, as its own defaults would run it), and their
+ratio; both are measured in the same run, in turns. Expect a ratio above 25 (level 1 on both sides)
+on one CPU core; compiling (not counted) takes 10 to 20 s, the run itself about 5 s.
+"""
+
+from __future__ import annotations
+
+import resource
+import statistics
+import time
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+
+@dataclass(frozen=True)
+class Config:
+    """Options of the benchmark."""
+
+    batch: int = 64
+    """Samples solved side by side."""
+    repeats: int = 5
+    """Timings of each; the median counts."""
+    ngspice_samples: int = 40
+    """ngspice processes per timing."""
+    max_step: float = 0.5e-9
+    """Largest time step of ngspice [s]; the solver's parity is tested at 0.1e-9."""
+    models: tuple[str, ...] = ("level1", "ekv")
+    out: Path | None = None
+    """Write the result to this JSON file as well."""
+
+
+def _children() -> float:
+    usage = resource.getrusage(resource.RUSAGE_CHILDREN)
+    return usage.ru_utime + usage.ru_stime
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Measure and return CPU seconds per sample and ratios."""
+    import jax
+    import numpy as np
+
+    from failure.circuits.ldo.reference import ldo_decks
+    from failure.circuits.ldo.regulator import make_ldo
+    from failure.circuits.solver import ngspice
+
+    ngspice.require()
+    x = np.random.default_rng(0).normal(size=(config.batch, 60))
+    decks = ldo_decks(x[: config.ngspice_samples], max_step=config.max_step, reltol=1e-3)
+    circuits = {m: make_ldo(m) for m in config.models}
+    for circuit in circuits.values():
+        jax.block_until_ready(circuit.simulate(x))
+    ours: dict[str, list[float]] = {m: [] for m in config.models}
+    theirs = []
+    for _ in range(config.repeats):
+        for model, circuit in circuits.items():
+            start = time.process_time()
+            jax.block_until_ready(circuit.simulate(x))
+            ours[model].append((time.process_time() - start) / config.batch)
+        start = _children()
+        ngspice.run_many(decks, ("iq",), workers=1)
+        theirs.append((_children() - start) / len(decks))
+    reference = statistics.median(theirs)
+    result: dict[str, Any] = {"ngspice_ms": 1e3 * reference}
+    for model in config.models:
+        mine = statistics.median(ours[model])
+        result[f"{model}_ms"] = 1e3 * mine
+        result[f"{model}_ratio"] = reference / mine
+        result[f"{model}_ratios"] = [t / o for t, o in zip(theirs, ours[model], strict=True)]
+    return result
+
+
+if __name__ == "__main__":
+    import tyro
+
+    from snn_fusion_failure.runs import (
+        enable_compilation_cache,
+        print_result,
+        provenance,
+        write_json,
+    )
+
+    config = tyro.cli(Config, description=__doc__)
+    enable_compilation_cache()
+    result = main(config)
+    if config.out is not None:
+        write_json(config.out, {"benchmark": "circuits", **provenance(), **result})
+    print_result(**{k: v for k, v in result.items() if not isinstance(v, list)})

@@ -1,0 +1,167 @@
+"""Frames per second of each stage of the detector, and the share of the device's peak.
+
+    python scripts/benchmarks/bench_detector.py --preset small
+
+times maps and anchors, the forward pass with both stages, suppression alone, and a training step,
+for a random cloud of points. The peak is a large float32 matrix product on the same device in the
+same run; the work of a stage is the count of XLA. On a CPU the time is CPU time, which a busy
+machine does not change much. Minutes of compiling come first. `--record` writes
+`results/bench_detector.json`. Last line: `result: ...`.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any, Literal
+
+import tyro
+
+from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Time the stages of the detector."""
+
+    preset: Literal["paper", "small", "tiny"] = "small"
+    config: Literal["avod", "avod_argate"] = "avod_argate"
+    batch_size: int = 1
+    repeats: int = 5
+    gemm: int = 1024
+    """Side of the matrices of the peak."""
+    record: bool = False
+    """Write results/bench_detector.json."""
+    results: Path = repository.RESULTS
+
+
+def _example(detector: Any) -> Any:
+    """A frame of the preset's sizes: random points on the ground and cars at known places."""
+    import numpy as np
+
+    from fusion.detection.learning.examples import Example
+
+    rng = np.random.RandomState(0)
+    n, c = detector.max_points, detector.bev
+    low = np.array([c.x_range[0], 0.0, c.z_range[0]])
+    high = np.array([c.x_range[1], 1.7, c.z_range[1]])
+    camera = low + (high - low) * rng.uniform(size=(n, 3))
+    points = np.stack([camera[:, 2], -camera[:, 0], -camera[:, 1], np.full(n, 0.3)], axis=1)
+    truth = np.zeros((detector.max_objects, 7), np.float32)
+    near = rng.uniform(size=(4, 2))
+    truth[:4, 0] = c.x_range[0] + (0.25 + 0.5 * near[:, 0]) * (c.x_range[1] - c.x_range[0])
+    truth[:4, 2] = c.z_range[0] + (0.25 + 0.5 * near[:, 1]) * (c.z_range[1] - c.z_range[0])
+    truth[:4, [1, 3, 4, 5]] = [1.7, 4.2, 1.7, 1.5]
+    p2 = np.array([[721.5, 0, 610, 0], [0, 721.5, 173, 0], [0, 0, 1, 0]], np.float32)
+    axes = np.array([[0, -1, 0, 0], [0, 0, -1, 0], [1, 0, 0, 0]], np.float32)
+    return Example(
+        rng.randint(0, 255, (*detector.image_size, 3)).astype(np.uint8),
+        points.astype(np.float32), np.ones(n, bool), axes, p2,
+        np.array([375.0, 1242.0], np.float32), np.array([0.0, -1, 0, 1.7], np.float32), truth,
+        np.arange(detector.max_objects) < 4,
+    )  # fmt: skip
+
+
+def _time(run: Callable[[], Any], repeats: int) -> float:
+    """Best of `repeats` calls [s]: CPU seconds on a CPU, wall seconds on an accelerator."""
+    import jax
+
+    clock = time.process_time if jax.devices()[0].platform == "cpu" else time.perf_counter
+    jax.block_until_ready(run())
+    best = float("inf")
+    for _ in range(repeats):
+        start = clock()
+        jax.block_until_ready(run())
+        best = min(best, clock() - start)
+    return best
+
+
+def _flops(compiled: Any) -> float:
+    cost = compiled.cost_analysis()
+    cost = cost[0] if isinstance(cost, list) else cost
+    return float((cost or {}).get("flops", float("nan")))
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Time every stage; returns the rows."""
+    enable_compilation_cache()
+    import jax
+    import jax.numpy as jnp
+
+    from fusion.detection.config import detector_preset
+    from fusion.detection.geometry.nms import nms
+    from fusion.detection.learning.detect import detect
+    from fusion.detection.learning.examples import make_inputs, stack_examples
+    from fusion.detection.learning.training import init_training, train_step, training_preset
+
+    detector, training = (
+        detector_preset(config.preset, config.config),
+        training_preset(config.preset),
+    )
+    batch = stack_examples([_example(detector)] * config.batch_size)
+    batch = jax.tree.map(jnp.asarray, batch)
+    key = jax.random.key(0)
+    state = jax.jit(functools.partial(init_training, config=detector, train=training))(key)
+    read = jax.jit(lambda b: jax.lax.map(lambda e: make_inputs(e, detector), b))
+    inputs = read(batch)
+    boxes = jax.random.uniform(key, (config.batch_size, detector.candidates, 2), maxval=40.0)
+    boxes = jnp.concatenate([boxes, boxes + 4.0], axis=-1)
+    scores = jax.random.uniform(key, boxes.shape[:2])
+    keep = jax.jit(jax.vmap(lambda b, s: nms(
+        b, s, jnp.ones(s.shape, bool), iou_threshold=detector.rpn_nms,
+        max_output=detector.proposals_train, max_candidates=detector.candidates,
+    )))  # fmt: skip
+    forward = jax.jit(functools.partial(detect, config=detector))
+    step = jax.jit(functools.partial(train_step, config=detector, train=training))
+    main_params, stats = state.params["main"], state.stats
+    stages: dict[str, tuple[Any, tuple[Any, ...], dict[str, Any]]] = {
+        "maps and anchors": (read, (batch,), {}),
+        "forward": (forward, (main_params, stats), {"inputs": inputs}),
+        "suppression": (keep, (boxes, scores), {}),
+        "training step": (step, (state, key, batch), {}),
+    }
+    square = jnp.ones((config.gemm, config.gemm))
+    product = jax.jit(lambda a: a @ a)
+    peak = 2.0 * config.gemm**3 / _time(lambda: product(square), config.repeats)
+    rows = []
+
+    def add(row: str, metric: str, unit: str, value: float) -> None:
+        cell = {"row": row, "model": config.config, "metric": metric, "unit": unit}
+        rows.append(cell | summarize([value]))
+
+    add("matrix product", "gflops", "GFLOP/s", peak / 1e9)
+    for name, (function, arguments, named) in stages.items():
+        compiled = function.lower(*arguments, **named).compile()
+        seconds = _time(functools.partial(compiled, *arguments, **named), config.repeats)
+        work = _flops(compiled)
+        add(name, "frames_per_second", "1/s", config.batch_size / seconds)
+        add(name, "gflop_per_frame", "GFLOP", work / config.batch_size / 1e9)
+        add(name, "peak_share", "%", 100.0 * work / seconds / peak)
+        print(
+            f"{name:18s} {config.batch_size / seconds:9.2f} frames/s "
+            f"{work / config.batch_size / 1e9:8.2f} GFLOP/frame "
+            f"{100.0 * work / seconds / peak:5.1f} % of the matrix product",
+            flush=True,
+        )
+    if config.record:
+        title = "Throughput of the detector by stage"
+        path = config.results / "bench_detector.json"
+        record_table(path, "bench_detector", title, rows, preset=config.preset)
+    speed = {
+        row["row"].replace(" ", "_"): row["mean"]
+        for row in rows
+        if row["metric"] == "frames_per_second"
+    }
+    print_result(preset=config.preset, gemm_gflops=peak / 1e9, **speed)
+    return {"rows": rows}
+
+
+if __name__ == "__main__":
+    try:
+        main(tyro.cli(Config, description=__doc__))
+    except (ValueError, FileNotFoundError) as error:
+        fail(str(error))

@@ -1,0 +1,263 @@
+"""How well the circuit solver agrees with ngspice, and how smooth and how robust it is.
+
+    python scripts/studies/study_parity.py [--parts ldo_ngspice ldo_grid box dcdc_ngspice dcdc_grid]
+
+Parts, each written to `results/study_circuit_parity.json` as soon as it is measured:
+
+- `ldo_ngspice`: LDO regulator, level 1, against ngspice's own level 1 over normal samples: DC
+  error, difference of the undershoot, rank correlation of every specification; the undershoot a
+  second time with the same constant gate capacitances on both sides (EKV).
+- `ldo_grid`: undershoot on the shipped grid against one with steps ten times shorter.
+- `box`: share of samples of the parameter box that do not converge, both circuits.
+- `dcdc_ngspice`: DC-DC converter against a transient of all transistors over all periods, and that
+  transient against itself with another step.
+- `dcdc_grid`: DC-DC specifications on the shipped grid against steps ten times shorter.
+
+About 8 CPU-minutes in all, most of it ngspice's.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from snn_fusion_failure.runs import (
+    enable_compilation_cache,
+    fail,
+    print_result,
+    provenance,
+    repository,
+    write_json,
+)
+
+TARGETS = {
+    "ldo_dc_relative_error": 1e-6,
+    "ldo_undershoot_V": 2e-3,
+    "ldo_rank_correlation": 0.99,
+    "not_converged_share": 1e-3,
+    "dcdc_rank_correlation": 0.9,
+    "dcdc_grid_share_of_spread": 0.01,
+}
+
+
+@dataclass(frozen=True)
+class Config:
+    """Sizes of the study."""
+
+    parts: tuple[str, ...] = ("ldo_ngspice", "ldo_grid", "box", "dcdc_ngspice", "dcdc_grid")
+    ldo_samples: int = 200
+    dcdc_samples: int = 40
+    grid_samples: int = 64
+    box_samples: int = 4096
+    max_step: float = 0.5e-9
+    """Largest time step of ngspice for the DC-DC converter [s]."""
+    workers: int = 2
+    """ngspice processes at a time."""
+    seed: int = 0
+    out: Path = repository.RESULTS / "study_circuit_parity.json"
+
+
+def ranks(a: Any, b: Any, names: tuple[str, ...]) -> dict[str, float]:
+    """Spearman correlation of every column."""
+    from scipy.stats import spearmanr
+
+    return {n: float(spearmanr(a[:, k], b[:, k]).statistic) for k, n in enumerate(names)}
+
+
+def spread(difference: Any, values: Any, names: tuple[str, ...]) -> dict[str, dict[str, float]]:
+    """Of every column: largest, mean and standard deviation of a difference; spread of values."""
+    import numpy as np
+
+    found = {}
+    for k, name in enumerate(names):
+        move, sd = difference[:, k], float(np.std(values[:, k]))
+        found[name] = {
+            "max": float(np.abs(move).max()),
+            "median": float(np.median(np.abs(move))),
+            "mean": float(move.mean()),
+            "sd": float(move.std()),
+            "spread": sd,
+            "max_share": float(np.abs(move).max()) / sd,
+            "sd_share": float(move.std()) / sd,
+        }
+    return found
+
+
+def ldo_ngspice(config: Config) -> dict[str, Any]:
+    """LDO regulator against ngspice."""
+    import numpy as np
+
+    from failure.circuits.ldo.regulator import make_ldo
+
+    x = np.random.default_rng(config.seed).normal(size=(config.ldo_samples, 60))
+    result: dict[str, Any] = {"samples": len(x)}
+    for model in ("level1", "ekv"):
+        circuit = make_ldo(model)
+        rows = x if model == "level1" else x[: len(x) // 4]
+        ours, status = (np.asarray(a) for a in circuit.simulate(rows))
+        theirs, failed = circuit.reference(rows, workers=config.workers)
+        good = (status == 0) & (failed == 0)
+        relative = np.abs(ours / theirs - 1.0)[good]
+        apart = np.abs(ours - theirs)[good, 1]
+        result[model] = {
+            "compared": int(good.sum()),
+            "not_converged": int((status != 0).sum()),
+            "ngspice_failed": int((failed != 0).sum()),
+            "dc_relative_error_max": float(relative[:, [0, 2]].max()),
+            "undershoot_difference_max_V": float(apart.max()),
+            "undershoot_difference_median_V": float(np.median(apart)),
+            "rank_correlation": ranks(ours[good], theirs[good], circuit.spec_names),
+        }
+    return result
+
+
+def ldo_grid(config: Config) -> dict[str, Any]:
+    """Undershoot of the LDO regulator on the shipped grid and on a ten times finer one."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from failure.circuits.ldo import regulator
+
+    fine = regulator.time_grid(10)
+    rng = np.random.default_rng(config.seed + 1)
+    x = {
+        "gaussian": rng.normal(size=(60, config.grid_samples)),
+        "box": rng.uniform(-3.0, 3.0, size=(60, config.grid_samples)),
+    }
+    result: dict[str, Any] = {"samples": config.grid_samples}
+    with jax.enable_x64(True):
+        shipped = jax.jit(regulator.solve_ldo)
+        finer = jax.jit(lambda u: regulator.solve_ldo(u, time=fine))
+        for name, u in x.items():
+            a, b = (np.asarray(f(jnp.asarray(u))[0]).T[:, 1:2] for f in (shipped, finer))
+            result[name] = spread(a - b, b, ("undershoot",))["undershoot"]
+            result[name]["beyond_2_mV"] = float(np.mean(np.abs(a - b) > 2e-3))
+    return result
+
+
+def box(config: Config) -> dict[str, Any]:
+    """Share of samples of the parameter box that do not converge."""
+    import numpy as np
+
+    from failure import circuits
+
+    result: dict[str, Any] = {"samples": config.box_samples}
+    for name in ("ldo", "dcdc"):
+        circuit = circuits.get(name)
+        rng = np.random.default_rng(config.seed + 2)
+        lo, hi = circuit.bounds
+        x = rng.uniform(lo, hi, size=(config.box_samples, circuit.n_dims))
+        _, status = circuit.simulate(x)
+        count = int(np.sum(np.asarray(status) != 0))
+        result[name] = {"not_converged": count, "share": count / len(x)}
+    return result
+
+
+def dcdc_ngspice(config: Config) -> dict[str, Any]:
+    """DC-DC converter against every transistor switching in every period."""
+    import numpy as np
+
+    from failure.circuits.buck.converter import make_dcdc
+
+    x = np.random.default_rng(config.seed).normal(size=(config.dcdc_samples, 44))
+    result: dict[str, Any] = {"samples": len(x), "max_step": config.max_step}
+    circuit = make_dcdc("level1")
+    ours, status = (np.asarray(a) for a in circuit.simulate(x))
+    names = circuit.spec_names
+    theirs, failed = circuit.reference(x, max_step=config.max_step, workers=config.workers)
+    coarse, failed_too = circuit.reference(
+        x, max_step=2.0 * config.max_step, workers=config.workers
+    )
+    good = (status == 0) & (failed == 0) & (failed_too == 0)
+    result["compared"] = int(good.sum())
+    result["rank_correlation"] = ranks(ours[good], theirs[good], names)
+    result["difference"] = spread((ours - theirs)[good], theirs[good], names)
+    result["ngspice_with_twice_the_step"] = {
+        "rank_correlation": ranks(coarse[good], theirs[good], names),
+        "difference": spread((coarse - theirs)[good], theirs[good], names),
+    }
+    return result
+
+
+def dcdc_grid(config: Config) -> dict[str, Any]:
+    """DC-DC specifications on the shipped grid and with steps ten times shorter."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from failure.circuits.buck import converter
+
+    x = np.random.default_rng(config.seed + 1).normal(size=(44, config.grid_samples))
+    result: dict[str, Any] = {"samples": config.grid_samples}
+    names = tuple(s.name for s in converter.SPECS)
+    with jax.enable_x64(True):
+
+        def solved(refine: int) -> Any:
+            run = jax.jit(lambda u: converter.solve_dcdc(u, refine=refine, points=8)[0])
+            return np.asarray(run(jnp.asarray(x))).T
+
+        fine = solved(10)
+        for refine in (1, 2, 4):
+            values = solved(refine)
+            result[f"steps_divided_by_{refine}"] = {
+                "difference": spread(values - fine, fine, names),
+                "rank_correlation": ranks(values, fine, names),
+            }
+    return result
+
+
+PARTS: dict[str, Callable[[Config], dict[str, Any]]] = {
+    "ldo_ngspice": ldo_ngspice,
+    "ldo_grid": ldo_grid,
+    "box": box,
+    "dcdc_ngspice": dcdc_ngspice,
+    "dcdc_grid": dcdc_grid,
+}
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Measure the parts; returns everything that is on record."""
+    import json
+
+    unknown = [p for p in config.parts if p not in PARTS]
+    if unknown:
+        raise ValueError(f"unknown part {unknown[0]!r}; known: {', '.join(PARTS)}")
+    held: dict[str, Any] = {}
+    if config.out.exists():
+        held = json.loads(config.out.read_text(encoding="utf-8"))["parts"]
+    for name in config.parts:
+        held[name] = {**PARTS[name](config), **provenance()}
+        write_json(config.out, {"study": "circuit_parity", "targets": TARGETS, "parts": held})
+    return held
+
+
+def summary(held: dict[str, Any]) -> dict[str, float]:
+    """The numbers that have a target."""
+    found: dict[str, float] = {}
+    if "ldo_ngspice" in held:
+        part = held["ldo_ngspice"]["level1"]
+        found["dc_error"] = part["dc_relative_error_max"]
+        found["undershoot_mV"] = 1e3 * part["undershoot_difference_max_V"]
+        found["ldo_rank"] = min(part["rank_correlation"].values())
+    if "box" in held:
+        found["not_converged"] = held["box"]["ldo"]["share"]
+    if "dcdc_ngspice" in held:
+        found["dcdc_rank"] = min(held["dcdc_ngspice"]["rank_correlation"].values())
+    if "dcdc_grid" in held:
+        part = held["dcdc_grid"]["steps_divided_by_1"]["difference"]
+        found["dcdc_grid_share"] = max(p["max_share"] for p in part.values())
+    return found
+
+
+if __name__ == "__main__":
+    import tyro
+
+    try:
+        config = tyro.cli(Config, description=__doc__)
+        enable_compilation_cache()
+        print_result(**summary(main(config)))
+    except ValueError as error:
+        fail(str(error))

@@ -1,0 +1,166 @@
+"""Which readings and constants let a spiking network learn: variants around a setting, compared.
+
+    python scripts/studies/study_snn.py --study readings --seeds 8 --scenario 2
+    python scripts/studies/study_snn.py --study gamma --network S2 --seeds 8 --max-minutes 30
+
+Every variant is a named setting (`literal` or `tuned`) with a few changes, run over the same seeds
+on a training scenario; test maps and the seeds of the tables of record are never used. Rows go to
+`results/study_snn_STUDY.json` as each variant ends; a variant that is there already (same seeds) is
+skipped, so a study can be broken off and gone on with. About 3 CPU-seconds per seed and variant.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from typing import Any, Literal
+
+import tyro
+
+from snn_fusion_failure.commands.train_snn import make_runner, metrics, parse_changes, per_seed
+from snn_fusion_failure.records.rows import record_table
+from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
+
+TITLE = "Variants of a network around a setting"
+# study -> variant -> (setting, changes)
+STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
+    # One reading or option at a time: what the source says with one of ours, ours without one.
+    "readings": {
+        "literal": ("literal", ()),
+        "literal, causal half only": ("literal", ("stdp.anti_causal=0",)),
+        "literal, centred eligibility": ("literal", ("params.centring=1", "stdp.anti_causal=0.5")),
+        "tuned": ("tuned", ()),
+        "tuned, eligibility not centred": ("tuned", ("params.centring=0",)),
+        "tuned, reward without a goal angle": ("tuned", ("reward.goal_angle=Infinity",)),
+        "tuned, no commitment before a wall": ("tuned", ("reward.commit=0",)),
+        "tuned, target rewarded within 200 px only": (
+            "tuned",
+            ("reward.d_target=200", "reward.r3_base=1"),
+        ),
+        "tuned, r3 added as printed (base 1)": ("tuned", ("reward.r3_base=1",)),
+        "tuned, target rewarded near obstacles, too": (
+            "tuned",
+            ("reward.target_near_obstacle=1",),
+        ),
+        "tuned, r3 for one motor only": ("tuned", ("reward.opponent=0",)),
+        "tuned, anti-causal half as printed": ("tuned", ("stdp.anti_causal=1",)),
+        "tuned, causal half only": ("tuned", ("stdp.anti_causal=0",)),
+        "tuned, no homeostasis": ("tuned", ("params.homeostasis=0",)),
+        "tuned, angle code by region number": ("tuned", ("config.angle_code=region",)),
+        "tuned, angle code as listed": ("tuned", ("config.angle_code=listed",)),
+        "tuned, soft bounds": ("tuned", ("config.bounds=soft",)),
+    },
+    "gamma": {
+        f"tuned, gamma {g:g}": ("tuned", (f"params.gamma={g}",))
+        for g in (5e-5, 1.5e-4, 4.5e-4, 1.35e-3, 4e-3)
+    },
+    "goal": {
+        f"tuned, goal {g} degrees": ("tuned", (f"reward.goal_angle={g}",)) for g in (30, 45, 60, 90)
+    },
+    "tau_z": {
+        f"tuned, tau_z {t:g} s": ("tuned", (f"stdp.tau_z={t}",)) for t in (0.01, 0.025, 0.1, 0.3)
+    },
+    "homeostasis": {
+        f"tuned, homeostasis {h:g}/s": ("tuned", (f"params.homeostasis={h}",))
+        for h in (0.001, 0.005, 0.02, 0.05)
+    },
+    "rates": {
+        f"tuned, rates {h:g}/{o:g} Hz": (
+            "tuned",
+            (f"params.rate_hidden={h}", f"params.rate_output={o}"),
+        )
+        for h, o in ((10, 40), (25, 40), (25, 60), (25, 100), (50, 60))
+    },
+    "window": {
+        f"tuned, control {c} ms, held {h} ms": (
+            "tuned",
+            (f"config.control_steps={c}", f"config.hold_steps={h}"),
+        )
+        for c, h in ((100, 100), (200, 50), (200, 100), (200, 200), (400, 100))
+    },
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Compare variants."""
+
+    study: Literal["readings", "gamma", "goal", "tau_z", "homeostasis", "rates", "window"] = (
+        "readings"
+    )
+    network: Literal["S1", "S2", "S3", "S4"] = "S4"
+    scenario: Literal[1, 2, 3] = 1
+    seeds: int = 8
+    first_seed: int = 1000
+    """Not among the seeds of the tables of record (0 to 63)."""
+    test_trials: int = 10
+    max_steps: int = 200
+    block: int = 8
+    only: tuple[str, ...] = ()
+    """Names of variants; all by default."""
+    max_minutes: float = 30.0
+    """No variant is begun after so many minutes of CPU time."""
+
+
+def main(config: Study) -> dict[str, Any]:
+    """Run the variants that are missing; returns SR-testing by variant."""
+    from jaxsnn.presets import network_setting
+
+    variants = STUDIES[config.study]
+    unknown = set(config.only) - set(variants)
+    if unknown:
+        raise ValueError(f"only = {sorted(unknown)}: expected some of {sorted(variants)}")
+    enable_compilation_cache()
+    path = repository.RESULTS / f"study_snn_{config.study}.json"
+    held = set()
+    if path.exists():
+        for row in json.loads(path.read_text(encoding="utf-8"))["rows"]:
+            if row["metric"] == "sr_testing" and row["n"] >= config.seeds:
+                held.add((row["row"], row["model"]))
+    model = f"{config.network} scenario {config.scenario}"
+    done: dict[str, float] = {}
+    runners: dict[Any, Any] = {}
+    start = time.process_time()
+    for name, (setting, changes) in variants.items():
+        if (config.only and name not in config.only) or (name, model) in held:
+            continue
+        if time.process_time() - start > 60 * config.max_minutes:
+            break
+        built, params = network_setting(config.network, setting, **parse_changes(changes))
+        if built not in runners:
+            runners[built] = make_runner(
+                built, config.scenario, n_learn=20, n_test=config.test_trials, n_online=0,
+                max_steps=config.max_steps, block=config.block, record=False,
+            )  # fmt: skip
+        numbers = list(range(config.first_seed, config.first_seed + config.seeds))
+        experiment = runners[built](numbers, params)
+        records = per_seed(experiment, numbers)
+        summary = metrics(records)
+        rows = [
+            {"row": name, "model": model, "metric": metric, "setting": setting,
+             "changes": list(changes), **values}
+            for metric, values in summary.items()
+        ]  # fmt: skip
+        rates = [sum(r["testing"]["rates"][k] for r in records) / len(records) for k in range(3)]
+        rows[0]["rates_testing"] = rates
+        preset = f"{config.seeds} seeds, {config.test_trials} testing trials"
+        record_table(path, path.stem, TITLE, rows, preset=preset)
+        done[name] = summary["sr_testing"]["mean"]
+        print(name, {m: round(v["mean"], 1) for m, v in summary.items()}, flush=True)
+    return done
+
+
+def run_cli() -> None:
+    """Parse, run, print the result line."""
+    config = tyro.cli(Study, description=__doc__)
+    try:
+        done = main(config)
+    except ValueError as error:
+        fail(str(error))
+    best = max(done, key=lambda name: done[name]) if done else "none"
+    print_result(variants=len(done), best=best.replace(" ", "_"))
+
+
+if __name__ == "__main__":
+    run_cli()

@@ -1,0 +1,1 @@
+"""Tooling on top of `jaxsnn`, `fusion` and `failure`: commands, sweeps, runs, records."""

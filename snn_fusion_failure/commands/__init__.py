@@ -1,0 +1,1 @@
+"""The commands that a user types: `sff NAME`, or `python scripts/NAME.py` in a checkout."""

@@ -1,0 +1,1 @@
+"""What keeps the documentation true: commands that run, lists read off the code."""

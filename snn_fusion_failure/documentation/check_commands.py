@@ -1,0 +1,295 @@
+"""Run every command of README.md and docs/, each at its smallest size.
+
+    python scripts/tools/check_commands.py
+    python scripts/tools/check_commands.py --only train_snn reproduce
+
+The commands are those that a reader finds, with the options of the table in
+snn_fusion_failure/documentation/commands.py appended. They run in a copy of the repository in a temporary folder, with made-up data sets
+and simulated KITTI frames, so that the repository and its results/ are not touched. Commands of one
+area share a process, as a notebook would: what is imported and compiled once serves the next. One
+line for each with its time; what is not run says why; the log of a command that fails is shown.
+Exit status 1 when one fails. About nine minutes on two cores, after the test suite has compiled.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import importlib.util
+import json
+import os
+import runpy
+import shlex
+import shutil
+import subprocess
+import sys
+import tempfile
+import threading
+import time
+import traceback
+from collections.abc import Iterator, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+from snn_fusion_failure.documentation import commands as documented_commands
+from snn_fusion_failure.documentation import sample_data
+from snn_fusion_failure.runs import repository, write_text
+
+CHECKED = ("results", "docs", "README.md")
+"""What no command may change in the repository itself."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Run the documented commands."""
+
+    only: tuple[str, ...] = ()
+    """Only commands in which one of these texts occurs."""
+    jobs: int = 2
+    """Processes side by side."""
+    list: bool = False
+    """Print what would be run, and run nothing."""
+    keep: Path | None = None
+    """Make the copy here and leave it, with a log for each command."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Done:
+    """One command that was run: wall and CPU seconds, and what went wrong."""
+
+    number: int
+    seconds: float
+    cpu: float
+    error: str = ""
+
+
+def missing(rule: documented_commands.Rule) -> str:
+    """The program or package that a command needs and that is not here, in words."""
+    name = rule.needs
+    if not name or shutil.which(name) or importlib.util.find_spec(name):
+        return ""
+    return f"{name} is not installed"
+
+
+def state(folder: Path) -> str:
+    """What git says of the files that no command may change."""
+    held = ""
+    for arguments in (["status", "--porcelain"], ["diff", "HEAD"]):
+        held += subprocess.run(
+            ["git", *arguments, "--", *CHECKED],
+            cwd=folder, capture_output=True, text=True, check=False,
+        ).stdout  # fmt: skip
+    return held
+
+
+def copy_repository(target: Path) -> None:
+    """All files of the repository that git does not ignore."""
+    listed = subprocess.run(
+        ["git", "ls-files", "-z", "--cached", "--others", "--exclude-standard"],
+        cwd=repository.ROOT, capture_output=True, text=True, check=True,
+    )  # fmt: skip
+    for name in filter(None, listed.stdout.split("\0")):
+        if (repository.ROOT / name).is_file():
+            (target / name).parent.mkdir(parents=True, exist_ok=True)
+            shutil.copy2(repository.ROOT / name, target / name)
+
+
+@contextlib.contextmanager
+def into_files(log: Path) -> Iterator[None]:
+    """All that this process and its children print goes to `log`.out and `log`.err."""
+    held = os.dup(1), os.dup(2)
+    sys.stdout.flush()
+    sys.stderr.flush()
+    with (
+        log.with_suffix(".out").open("w", encoding="utf-8") as out,
+        log.with_suffix(".err").open("w", encoding="utf-8") as err,
+        contextlib.redirect_stdout(out),
+        contextlib.redirect_stderr(err),
+    ):
+        try:
+            os.dup2(out.fileno(), 1)
+            os.dup2(err.fileno(), 2)
+            yield
+        finally:
+            for number, descriptor in enumerate(held, start=1):
+                os.dup2(descriptor, number)
+                os.close(descriptor)
+
+
+def execute(words: Sequence[str], log: Path) -> str:
+    """Run one command in this process, as `python` would; returns what went wrong."""
+    error = ""
+    held = sys.argv
+    with into_files(log):
+        try:
+            if words[:2] == ["python", "-c"]:
+                exec(compile(words[2], "<command>", "exec"), {"__name__": "__main__"})
+            else:
+                sys.argv = list(words)
+                runpy.run_path(words[0], run_name="__main__")
+        except SystemExit as leaving:
+            error = f"exit status {leaving.code}" if leaving.code else ""
+        except BaseException:
+            traceback.print_exc()
+            error = traceback.format_exc().strip().splitlines()[-1]
+        finally:
+            sys.argv = held
+    printed = log.with_suffix(".out").read_text(encoding="utf-8").strip().splitlines()
+    if not error and words[0] != "python" and not (printed and printed[-1].startswith("result:")):
+        error = "the last line is no `result: ...`"
+    return error
+
+
+def cpu_seconds() -> float:
+    """CPU time of this process and of its children that have ended."""
+    used = os.times()
+    return used.user + used.system + used.children_user + used.children_system
+
+
+def work(folder: Path, numbers: Sequence[int]) -> None:
+    """Run commands one after another in the copy; a JSON line for each on stdout."""
+    commands = documented_commands.documented()
+    if folder != repository.ROOT:
+        raise RuntimeError(f"scripts come from {repository.ROOT}, expected {folder}")
+    logs = folder / "logs"
+    if any(commands[n].area == "detector" for n in numbers):
+        with into_files(logs / "frames"):
+            sample_data.make_frames(folder)
+    for number in numbers:
+        start, used = time.monotonic(), cpu_seconds()
+        error = execute(commands[number].words, logs / f"{number:03d}")
+        if (pyplot := sys.modules.get("matplotlib.pyplot")) is not None:
+            pyplot.close("all")
+        done = Done(number, time.monotonic() - start, cpu_seconds() - used, error)
+        print(json.dumps(dataclasses.asdict(done)), flush=True)
+
+
+def run_area(folder: Path, numbers: Sequence[int]) -> Iterator[Done]:
+    """Run commands of one area in a process of their own."""
+    environment = os.environ | {
+        "PYTHONPATH": str(folder),
+        "FUSION_DATA_DIR": str(folder / "data"),
+        "MPLBACKEND": "agg",
+    }
+    environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(repository.ROOT / ".cache" / "jax"))
+    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    code = (
+        "import sys; from pathlib import Path; "
+        "from snn_fusion_failure.documentation.check_commands import work; "
+        "work(Path(sys.argv[1]), [int(n) for n in sys.argv[2:]])"
+    )
+    left = list(numbers)
+    with subprocess.Popen(
+        [sys.executable, "-c", code, str(folder), *map(str, numbers)],
+        cwd=folder, env=environment, stdout=subprocess.PIPE, text=True,
+    ) as process:  # fmt: skip
+        for line in process.stdout or ():
+            done = Done(**json.loads(line))
+            left.remove(done.number)
+            yield done
+    for number in left:
+        yield Done(number, 0.0, 0.0, f"its process ended with status {process.returncode}")
+
+
+def choose(config: Config) -> tuple[dict[int, documented_commands.Command], dict[int, str]]:
+    """Commands to run, and why others are not, by number.
+
+    Raises:
+        ValueError: the table has no rule for a command, or `only` leaves none.
+    """
+    commands = dict(enumerate(documented_commands.documented()))
+    chosen = {
+        n: c
+        for n, c in commands.items()
+        if not config.only or any(text in c.text for text in config.only)
+    }
+    if not chosen:
+        raise ValueError(f"only={config.only}: no documented command has one of these texts")
+    lacking = [c.text for c in chosen.values() if c.rule is None]
+    if lacking:
+        raise ValueError(
+            f"snn_fusion_failure/documentation/commands.py has no rule for {lacking[0]!r}"
+        )
+    why = {n: c.rule.not_run or missing(c.rule) for n, c in chosen.items() if c.rule}
+    return {n: c for n, c in chosen.items() if not why[n]}, {n: w for n, w in why.items() if w}
+
+
+def run_all(
+    config: Config, folder: Path, chosen: dict[int, documented_commands.Command]
+) -> list[Done]:
+    """Run the chosen commands in the copy, area by area, and print a line for each."""
+    (folder / "logs").mkdir(parents=True)
+    copy_repository(folder)
+    areas: dict[str, list[int]] = {}
+    for number, command in chosen.items():
+        areas.setdefault(command.area, []).append(number)
+        # Before anything runs: another process must not see a file go.
+        if command.rule and command.rule.forget:
+            (folder / command.rule.forget).unlink(missing_ok=True)
+        if command.rule and command.rule.held:
+            write_text(folder / command.rule.held[0], command.rule.held[1])
+    if documented_commands.FUSION_DATA in areas:
+        sample_data.make_data(folder / "data")
+    finished: list[Done] = []
+    lock = threading.Lock()
+
+    def one(numbers: list[int]) -> None:
+        for done in run_area(folder, numbers):
+            with lock:
+                finished.append(done)
+                share = f"{len(finished)}/{len(chosen)}"
+                mark = "FAILED" if done.error else "ok"
+                print(
+                    f"[{share:>6}] {done.seconds:6.1f} s (CPU {done.cpu:5.1f} s)  {mark:6}  "
+                    f"{chosen[done.number].text}",
+                    flush=True,
+                )
+                if done.error:
+                    print(explain(folder, done, chosen[done.number]), flush=True)
+
+    with ThreadPoolExecutor(config.jobs) as pool:
+        list(pool.map(one, sorted(areas.values(), key=len, reverse=True)))
+    return finished
+
+
+def explain(folder: Path, done: Done, command: documented_commands.Command) -> str:
+    """What a command that failed was, and the end of what it printed."""
+    lines = [f"  in {command.page}, run as: {shlex.join(command.words)}", f"  {done.error}"]
+    for kind in ("out", "err"):
+        log = folder / "logs" / f"{done.number:03d}.{kind}"
+        if log.exists():
+            text = log.read_text(encoding="utf-8", errors="replace").strip()
+            lines += [f"  | {line}" for line in text.splitlines()[-8:]]
+    return "\n".join(lines)
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Run the commands; returns how many were run, were not run, and failed."""
+    chosen, why = choose(config)
+    commands = documented_commands.documented()
+    for number, reason in why.items():
+        print(f"not run: {commands[number].text}: {reason}")
+    if config.list:
+        for command in chosen.values():
+            print(f"{command.area:9} {shlex.join(command.words)}")
+        return {"executed": 0, "not_run": len(why), "failed": 0}
+    start, before = time.monotonic(), state(repository.ROOT)
+    with contextlib.ExitStack() as stack:
+        if config.keep is None:
+            name = stack.enter_context(tempfile.TemporaryDirectory(prefix="commands-"))
+            folder = Path(name).resolve() / "repository"
+        else:
+            folder = config.keep.resolve()
+        finished = run_all(config, folder, chosen)
+    failed = sum(bool(done.error) for done in finished)
+    if state(repository.ROOT) != before:
+        print(f"FAILED: something changed {', '.join(CHECKED)} of the repository meanwhile")
+        failed += 1
+    return {
+        "executed": len(finished),
+        "not_run": len(why),
+        "failed": failed,
+        "seconds": time.monotonic() - start,
+        "cpu_seconds": sum(done.cpu for done in finished),
+    }

@@ -1,0 +1,1 @@
+"""Rows of record, statistics over seeds, and the pages that show them."""

@@ -1,0 +1,251 @@
+"""Tables 3.1 to 3.6: which trainings fill their cells, and how runs become a table of record.
+
+A run is one (table, row, model, seed). Its scores go to a file of their own as soon as they exist,
+so an interrupted reproduction loses the run in flight and repeats none.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from snn_fusion_failure.records.rows import summarize
+
+if TYPE_CHECKING:
+    from fusion.failures import FailureKind
+
+FIVE = ("baseline", "netgated", "argate_ws", "argate_plus", "argate_l")
+REFERENCES = ("oracle", "modality_dropout", "embracenet")
+UNSEEN_KINDS: tuple[FailureKind, ...] = ("zero", "stuck", "drift", "dropout", "gain", "clip")
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One row of a table: data set and failure protocol, as the command `train_argate` has them.
+
+    Attributes:
+        name: as the source's table spells it.
+        settings: fields of `train_argate.Config` that differ from its defaults.
+        references: train the reference models on this row too.
+        robustness: also score under the failure kinds that are never trained on.
+        channel: keep this channel's fusion weights (Figure 3.7).
+    """
+
+    name: str
+    settings: dict[str, Any]
+    references: tuple[str, ...] = ()
+    robustness: bool = False
+    channel: str | None = None
+
+
+def _random(dataset: str, n_clean: int, kind: str, **options: Any) -> Row:
+    settings = {"dataset": dataset, "protocol": "random", "n_clean": n_clean, "kind": kind}
+    return Row(f"n_clean={n_clean} {kind}", settings, **options)
+
+
+def _ranges(dataset: str, train: tuple[int, int], test: tuple[int, int]) -> Row:
+    settings = {
+        "dataset": dataset,
+        "protocol": "generalisation",
+        "train_range": train,
+        "test_range": test,
+    }
+    return Row(f"({train[0]},{train[1]})({test[0]},{test[1]})", settings)
+
+
+def _fixed(dataset: str, n_clean: int) -> Row:
+    return Row(f"n_clean={n_clean}", {"dataset": dataset, "protocol": "fixed", "n_clean": n_clean})
+
+
+TABLES: dict[str, tuple[str, tuple[Row, ...]]] = {
+    "3.1": (
+        "HAR, clean and random failing sensor assignment, accuracy %",
+        (
+            Row("clean", {"dataset": "har", "protocol": "clean"}),
+            _random("har", 8, "uniform", references=("oracle",)),
+            _random("har", 8, "gaussian"),
+            _random("har", 5, "uniform", references=REFERENCES, robustness=True),
+            _random("har", 5, "gaussian"),
+            _random("har", 1, "uniform", references=REFERENCES, channel="total_acc_y"),
+            _random("har", 1, "gaussian", references=("oracle",)),
+        ),
+    ),
+    "3.2": (
+        "HAR, fixed failing sensor assignment (uniform), accuracy %",
+        (_fixed("har", 6), _fixed("har", 5)),
+    ),
+    "3.3": (
+        "HAR, failing sensor generation test, accuracy %",
+        tuple(_ranges("har", (1, b), (b + 1, 8)) for b in (2, 3, 4)),
+    ),
+    "3.4": (
+        "Driver identification, fixed failing sensor assignment (uniform), accuracy %",
+        (_fixed("driver", 5), _fixed("driver", 7)),
+    ),
+    "3.5": (
+        "Driver identification, clean and random failing sensor assignment, accuracy %",
+        (
+            Row("clean", {"dataset": "driver", "protocol": "clean"}),
+            _random("driver", 12, "uniform", references=("oracle",)),
+            _random("driver", 12, "gaussian"),
+            _random("driver", 8, "uniform", references=REFERENCES, robustness=True),
+            _random("driver", 8, "gaussian"),
+            _random("driver", 5, "uniform", references=REFERENCES),
+            _random("driver", 5, "gaussian", references=("oracle",)),
+        ),
+    ),
+    "3.6": (
+        "Driver identification, failing sensor generation test, accuracy %",
+        (_ranges("driver", (1, 2), (3, 15)),),
+    ),
+}
+
+
+@dataclasses.dataclass(frozen=True)
+class Run:
+    """One training: a row of a table, a model, a seed."""
+
+    table: str
+    row: Row
+    model: str
+    seed: int
+
+    def path(self, out: Path) -> Path:
+        """Where its scores are kept."""
+        name = self.row.name.replace(" ", "_").replace("(", "").replace(")", "_").replace(",", "-")
+        return out / self.table / name.strip("_") / self.model / f"{self.seed}.json"
+
+
+def runs(table: str, seeds: int) -> Iterator[Run]:
+    """All runs of a table, seed by seed, so that an early stop leaves whole seeds."""
+    _, rows = TABLES[table]
+    for seed in range(seeds):
+        for row in rows:
+            for model in (*FIVE, *row.references):
+                yield Run(table, row, model, seed)
+
+
+def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
+    """Train and score one run."""
+    import jax
+    import numpy as np
+
+    from fusion import evaluate
+    from fusion.loop import fit, test_output
+    from fusion.models import count_parameters
+    from snn_fusion_failure.commands.train_argate import Config, build, scores
+
+    config = Config(model=run.model, preset=preset, seed=run.seed, **run.row.settings)
+    settings, corruption = build(config, dataset)
+    key = jax.random.key(run.seed)
+    fitted = fit(key, dataset, settings.model, settings.train, settings.hyper, corruption)
+    output = test_output(key, fitted.state, dataset, settings.model, corruption)
+    record = scores(output, dataset.n_classes) | {
+        "parameters": count_parameters(settings.model),
+        "epochs": settings.train.epochs,
+        "train_loss": fitted.history[-1]["total"],
+    }
+    if run.row.robustness and run.model != "oracle":
+        record["robustness"] = {}
+        for kind in UNSEEN_KINDS:
+            seen = test_output(key, fitted.state, dataset, settings.model, corruption, kind=kind)
+            record["robustness"][kind] = 100.0 * evaluate.accuracy(
+                seen.labels, seen.logits.argmax(-1)
+            )
+    if run.row.channel is not None:
+        index = dataset.channels.index(run.row.channel)
+        corrupted = output.failed.any(axis=1)
+        weights, failed = output.weights[corrupted, index], output.failed[corrupted, index]
+        record["channel"] = {
+            "name": run.row.channel,
+            "when_failed": np.round(weights[failed], 4),
+            "when_clean": np.round(weights[~failed], 4),
+        }
+    return record
+
+
+METRICS = (
+    "accuracy",
+    "accuracy_clean",
+    "accuracy_corrupted",
+    "gate_auroc_pooled",
+    "gate_auroc_channel",
+)
+
+
+def load_runs(table: str, out: Path, seeds: int) -> dict[tuple[str, str], dict[int, Any]]:
+    """Scores on disk: (row, model) -> seed -> record."""
+    held: dict[tuple[str, str], dict[int, Any]] = {}
+    for run in runs(table, seeds):
+        path = run.path(out)
+        if path.exists():
+            record = json.loads(path.read_text(encoding="utf-8"))
+            held.setdefault((run.row.name, run.model), {})[run.seed] = record
+    return held
+
+
+def collect(
+    table: str, out: Path, seeds: int, source: dict[str, Any]
+) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows of the table of record and paired comparisons, from the runs on disk.
+
+    Args:
+        table: its number.
+        out: folder of the runs.
+        seeds: how many seeds to look for.
+        source: the source's tables.
+
+    Returns:
+        (rows in the schema of record, paired comparisons between neighbouring models and gap
+        closures to the oracle gate).
+    """
+    import numpy as np
+
+    from fusion import evaluate
+
+    held = load_runs(table, out, seeds)
+    printed = source[table]
+    rows: list[dict[str, Any]] = []
+    studies: list[dict[str, Any]] = []
+    for (row, model), by_seed in held.items():
+        order = sorted(by_seed)
+        for metric in METRICS:
+            values = [by_seed[s][metric] for s in order]
+            if any(v is None for v in values):
+                continue
+            unit = "%" if metric.startswith("accuracy") else "1"
+            cell: dict[str, Any] = {"row": row, "model": model, "metric": metric, "unit": unit}
+            cell |= summarize(values)
+            if metric == "accuracy" and model in printed["columns"]:
+                cell["source"] = printed["rows"][row][printed["columns"].index(model)]
+            rows.append(cell)
+    for row in dict.fromkeys(name for name, _ in held):
+        pairs = [("argate_plus", "baseline"), ("argate_l", "argate_plus"), ("argate_l", "baseline")]
+        for better, worse in pairs:
+            a, b = held.get((row, better), {}), held.get((row, worse), {})
+            common = sorted(set(a) & set(b))
+            if len(common) < 2:
+                continue
+            test = evaluate.paired_test(
+                [a[s]["accuracy"] for s in common], [b[s]["accuracy"] for s in common]
+            )
+            studies.append({"row": row, "comparison": f"{better} - {worse}", **test._asdict()})
+        oracle = held.get((row, "oracle"), {})
+        for model in FIVE[1:]:
+            three = [held.get((row, model), {}), held.get((row, "baseline"), {}), oracle]
+            common = sorted(set(three[0]) & set(three[1]) & set(three[2]))
+            if common:
+                values = [[t[s]["accuracy"] for s in common] for t in three]
+                gap = evaluate.gap_closure(*(np.asarray(v) for v in values))
+                studies.append(
+                    {
+                        "row": row,
+                        "comparison": f"gap closure {model}",
+                        "n": len(common),
+                        "value": gap,
+                    }
+                )
+    return rows, studies

@@ -1,0 +1,57 @@
+"""Rows of record: a number with its interval, and the command, commit and seeds that made it."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterable, Sequence
+from pathlib import Path
+from typing import Any
+
+from snn_fusion_failure.runs.files import write_json
+from snn_fusion_failure.runs.provenance import provenance
+
+
+def summarize(values: Sequence[float]) -> dict[str, Any]:
+    """`n`, `mean`, `ci95` (Student's t interval of the mean) and the `values` themselves."""
+    from fusion.evaluate import mean_interval
+
+    values = list(values)
+    if len(values) == 1:
+        return {"n": 1, "mean": values[0], "ci95": None, "values": values}
+    found = mean_interval(values)
+    return {"n": len(values), "mean": found.mean, "ci95": [found.low, found.high], "values": values}
+
+
+def record_table(
+    path: Path, table: str, title: str, rows: Iterable[dict[str, Any]], *, preset: str
+) -> None:
+    """Write or update a table of record; rows are replaced by (row, model, metric), others stay.
+
+    Every row keeps the command and the commit that made it.
+    """
+    made = provenance()
+    rows = [{"command": made["command"], "git": made["git"], **row} for row in rows]
+    held: list[dict[str, Any]] = []
+    if path.exists():
+        held = json.loads(path.read_text(encoding="utf-8"))["rows"]
+
+    def key(row: dict[str, Any]) -> tuple[Any, ...]:
+        return row["row"], row["model"], row["metric"]
+
+    new = {key(row) for row in rows}
+    kept = [row for row in held if key(row) not in new]
+    write_json(
+        path,
+        {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows},
+    )
+
+
+def record_comparisons(
+    results: Path, table: str, title: str, rows: list[dict[str, Any]], *, preset: str
+) -> None:
+    """Write the paired comparisons of a table of record beside it, as `study_paired_N.json`."""
+    write_json(
+        results / f"study_paired_{table.replace('.', '_')}.json",
+        {"table": table, "title": f"{title}: paired comparisons", "rows": rows, "preset": preset}
+        | provenance(),
+    )

@@ -1,0 +1,140 @@
+r"""Study `failure`: search a circuit for its worst case, the whole search in one compiled program.
+
+A Gaussian process in the full space, refitted every `refit_every` simulations; the next point is
+the candidate with the best :math:`(1 - w) \mu + w \sigma`, candidates being drawn as TuRBO draws
+them. Lighter than `failure.search.bayesopt`, which loops on the host and climbs to the maximum of
+the acquisition: this one can be mapped over settings. Axes: `size`, half width of the box [sigma];
+`weight`, :math:`w`; `region`, side of the box around the best point from which local candidates
+come, as a share of the whole.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+
+from failure import circuits
+from failure.models import acquisition, gp, gp_fit
+from failure.models.optimize import Domain, box, sample
+from snn_fusion_failure.sweeps.study import Metric, Study
+
+__all__ = ["SearchParams", "make"]
+
+
+class SearchParams(NamedTuple):
+    """Leaves of the search."""
+
+    size: float = 3.0
+    weight: float = 0.5
+    region: float = 1.0
+
+
+def make(
+    circuit: str = "ldo",
+    spec: str = "undershoot",
+    n_init: int = 20,
+    n_total: int = 60,
+    refit_every: int = 10,
+    candidates: int = 512,
+    threshold: float | None = None,
+) -> Study:
+    """A circuit's specification; with a `threshold`, in the specification's unit, hits count."""
+    if not 4 <= n_init < n_total or refit_every < 1 or candidates < 8:
+        raise ValueError(
+            f"{n_init=}, {n_total=}, {refit_every=}, {candidates=}: expected 4 <= n_init < "
+            "n_total, refit_every >= 1 and candidates >= 8"
+        )
+    chosen = circuits.get(circuit)
+    column, dim = chosen.spec_index(spec), chosen.n_dims
+    unit, sense = chosen.specs[column].unit, chosen.specs[column].sense
+    sign = 1.0 if sense == "max" else -1.0
+    config = gp.GPConfig()
+
+    def simulate(x: Any) -> Any:
+        specs, status = chosen.run(x)
+        return jnp.where(status == 0, sign * specs[:, column], jnp.nan)
+
+    def filled(y: Any, n: Any) -> Any:
+        """Outputs for the surrogate: an invalid one counts as the best case seen."""
+        seen = (jnp.arange(n_total) < n) & jnp.isfinite(y)
+        return jnp.where(seen, y, jnp.min(jnp.where(seen, y, jnp.inf)))
+
+    def trial(params: SearchParams, key: Any) -> dict[str, Any]:
+        half = jnp.full((dim,), 0.5)
+        cube = box(-half, half)
+        scale = 2.0 * params.size
+        u = jnp.zeros((n_total, dim)).at[:n_init].set(sample(cube, key, n_init))
+        y = jnp.full((n_total,), jnp.nan).at[:n_init].set(simulate(scale * u[:n_init]))
+
+        def step(carry: Any, n: Any) -> Any:
+            u, y, fitted = carry
+            used = (jnp.arange(n_total) < n).astype(u.dtype)
+            raw = filled(y, n)
+            z, _, _ = gp.standardize(raw, used)
+            due = (n - n_init) % refit_every == 0
+            fitted = jax.lax.cond(
+                due, lambda: gp_fit.fit(config, u, z, n, fitted, max_evals=60).params,
+                lambda: fitted,
+            )  # fmt: skip
+            posterior = gp.condition(config, fitted, u, z, n)
+            _, top = jax.lax.top_k(jnp.where(used > 0, raw, -jnp.inf), 4)
+            reach = 0.5 * params.region
+            local = Domain(
+                jnp.maximum(-half, u[top[0]] - reach), jnp.minimum(half, u[top[0]] + reach),
+                jnp.asarray(jnp.inf),
+            )  # fmt: skip
+            points = acquisition.raw_points(local, u[top], jax.random.fold_in(key, n), candidates)
+            mean, variance = gp.predict(config, posterior, points)
+            value = acquisition.weighted(mean, jnp.sqrt(variance), jnp.asarray(params.weight))
+            point = points[jnp.argmax(value)]
+            return (u.at[n].set(point), y.at[n].set(simulate(scale * point[None])[0]), fitted), None
+
+        start = (u, y, gp_fit.initial_params(config, dim))
+        (_, y, _), _ = jax.lax.scan(step, start, jnp.arange(n_init, n_total))
+        valid = jnp.isfinite(y)
+        worst = sign * jnp.max(jnp.where(valid, y, -jnp.inf))
+        first = sign * jnp.max(jnp.where(valid, y, -jnp.inf)[:n_init])
+        out = {
+            "worst": worst,
+            "worst_initial": first,
+            "invalid": jnp.sum(~valid).astype(y.dtype),
+        }
+        if threshold is not None:
+            failed = valid & (y > sign * threshold)
+            out["hit"] = jnp.where(jnp.any(failed), 100.0, 0.0)
+            number = (jnp.argmax(failed) + 1).astype(y.dtype)
+            out["first_hit"] = jnp.where(jnp.any(failed), number, jnp.nan)
+        return out
+
+    def check(params: SearchParams) -> None:
+        for name, low, high in (("size", 0.0, 6.0), ("weight", -1e-9, 1.0), ("region", 0.0, 1.0)):
+            values = getattr(params, name)
+            if ((values <= low) | (values > high)).any():
+                worst = values[(values <= low) | (values > high)][0]
+                raise ValueError(f"{name} = {worst:g}: expected ({max(low, 0.0):g}, {high:g}]")
+
+    metrics = {
+        "worst": Metric(unit, f"worst {spec} found", "max" if sense == "max" else "min"),
+        "worst_initial": Metric(unit, f"worst {spec} of the initial design"),
+        "invalid": Metric("", "simulations that did not converge"),
+    }
+    if threshold is not None:
+        metrics["hit"] = Metric(
+            "%", f"searches that found {spec} beyond {threshold:g} {unit}", "max"
+        )
+        metrics["first_hit"] = Metric("", "simulations up to the first failure", "min", True)
+    return Study(
+        name="failure",
+        options={},
+        params=SearchParams(),
+        # One after another whatever the chunk size: a batched factorisation is no faster on a CPU,
+        # and a search amplifies its last bits.
+        run=lambda params, keys: jax.lax.map(lambda xs: trial(*xs), (params, keys)),
+        metrics=metrics,
+        objective="hit" if threshold is not None else "worst",
+        unit_of=lambda leaf: "sigma" if leaf == "size" else "",
+        check=check,
+        dtype="float64",
+    )

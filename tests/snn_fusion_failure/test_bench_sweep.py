@@ -1,0 +1,51 @@
+"""The simulation behind the scaling numbers has the known limits of a queue; costs add up."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from tests._scripts import load_script
+
+bench_sweep = load_script("benchmarks/bench_sweep")
+simulate = load_script("benchmarks/bench_sweep").simulate
+
+
+def test_one_worker_never_waits() -> None:
+    one = simulate(1, 2.0, 0.5, spread=0.3)
+    assert one["wait_s"] == 0.0
+    assert one["efficiency"] == pytest.approx(2.0 / 2.5, rel=0.1)
+
+
+@pytest.mark.parametrize("pull", [False, True])
+def test_a_saturated_folder_serves_at_its_own_rate(pull) -> None:
+    """Far beyond c / f + 1 workers the folder never rests: the rate is 1 / f."""
+    chunk_s, file_s, workers = 1.0, 0.1, 200
+    held = simulate(workers, chunk_s, file_s, spread=0.0, pull=pull)
+    # All 20 x 200 files, one after another, after the first chunks.
+    wanted = 20 * workers * chunk_s / (workers * (chunk_s + 20 * workers * file_s))
+    assert held["efficiency"] == pytest.approx(wanted, rel=1e-9)
+
+
+def test_below_saturation_waits_are_short() -> None:
+    few = simulate(20, 10.0, 0.01)
+    assert few["wait_s"] < 0.01
+    assert few["efficiency"] < 1.0
+
+
+def test_one_queue_balances_better_than_shards() -> None:
+    shards, pulled = (simulate(100, 10.0, 1e-3, pull=p)["efficiency"] for p in (False, True))
+    assert pulled > shards
+
+
+def test_measurements_on_a_small_folder(tmp_path) -> None:
+    config = dataclasses.replace(
+        bench_sweep.Config(), folder=tmp_path, repeats=5, writers=(1,), workers=(),
+        out=tmp_path / "bench.json",
+    )  # fmt: skip
+    result = bench_sweep.main(config)
+    assert result["chunk"]["1024 trials"]["bytes"] > result["chunk"]["16 trials"]["bytes"]
+    assert result["file_s"] == 1.0 / result["files_per_second_by_writers"]["1"]
+    assert len(result["simulated"]) == 3 * 5 * 2
+    assert [p.name for p in tmp_path.iterdir()] == ["bench.json"]  # tidied up

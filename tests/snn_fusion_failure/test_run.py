@@ -1,0 +1,138 @@
+"""Bookkeeping of the scripts: whole files, refusals, intervals, tables that grow."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+from scipy import stats
+
+from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.runs import (
+    append_metrics,
+    command_line,
+    fail,
+    open_run,
+    print_result,
+    repository,
+    write_json,
+    write_text,
+)
+
+
+@dataclasses.dataclass(frozen=True)
+class Settings:
+    model: str = "a"
+    epochs: int = 3
+    folder: Path = Path("x")
+
+
+def test_write_text_leaves_the_old_file_when_writing_fails(tmp_path: Path) -> None:
+    path = tmp_path / "new" / "file.json"
+    write_text(path, "old")
+    with pytest.raises(UnicodeEncodeError):
+        write_text(path, "new \udc80")  # a lone surrogate cannot be written
+    assert path.read_text() == "old"
+    assert [p.name for p in path.parent.iterdir()] == ["file.json"]
+
+
+def test_json_values(tmp_path: Path) -> None:
+    value = {
+        "settings": Settings(),
+        "array": np.asarray([1.5, np.nan], np.float32),
+        "scalar": np.float64(2.0),
+        "infinite": float("inf"),
+        3: {"set": {7}},
+    }
+    write_json(tmp_path / "v.json", value)
+    assert json.loads((tmp_path / "v.json").read_text()) == {
+        "settings": {"model": "a", "epochs": 3, "folder": "x"},
+        "array": [1.5, None],
+        "scalar": 2.0,
+        "infinite": None,
+        "3": {"set": [7]},
+    }
+
+
+def test_metrics_are_one_line_each(tmp_path: Path) -> None:
+    for epoch in range(2):
+        append_metrics(tmp_path / "run", {"epoch": epoch, "loss": np.float32(0.5)})
+    lines = (tmp_path / "run" / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line) for line in lines] == [{"epoch": e, "loss": 0.5} for e in range(2)]
+
+
+def test_a_run_folder_is_claimed_once(tmp_path: Path) -> None:
+    out = tmp_path / "run"
+    assert open_run(out, Settings()) == {"model": "a", "epochs": 3, "folder": "x"}
+    held = json.loads((out / "config.json").read_text())
+    assert held["settings"]["epochs"] == 3
+    assert {"command", "git", "versions", "device", "date"} <= set(held)
+    with pytest.raises(ValueError, match=r"already holds a run; pass --resume .* --overwrite"):
+        open_run(out, Settings())
+    open_run(out, Settings(), resume=True)
+    with pytest.raises(ValueError, match=r"other settings \(epochs: 3 -> 4; model: 'a' -> 'b'\)"):
+        open_run(out, Settings("b", 4), resume=True)
+
+
+def test_overwrite_forgets_the_old_numbers(tmp_path: Path) -> None:
+    open_run(tmp_path, Settings())
+    for name in ("metrics.jsonl", "result.json", "kept.txt"):
+        (tmp_path / name).write_text("old")
+    open_run(tmp_path, Settings("b"), overwrite=True)
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["config.json", "kept.txt"]
+    held = json.loads((tmp_path / "config.json").read_text())
+    assert held["settings"]["model"] == "b"
+
+
+@pytest.mark.parametrize("n", [2, 3, 5, 10, 31])
+def test_interval_is_student_s(n: int) -> None:
+    values = np.random.default_rng(n).normal(70.0, 2.0, n)
+    summary = summarize(values.tolist())
+    low, high = stats.t.interval(0.95, n - 1, values.mean(), stats.sem(values))
+    assert summary["n"] == n
+    np.testing.assert_allclose(summary["mean"], values.mean(), rtol=1e-12)
+    np.testing.assert_allclose(summary["ci95"], [low, high], rtol=1e-4)
+    assert summary["values"] == values.tolist()
+
+
+def test_one_run_has_no_interval() -> None:
+    assert summarize([4.0]) == {"n": 1, "mean": 4.0, "ci95": None, "values": [4.0]}
+
+
+def test_a_table_grows_and_is_corrected(tmp_path: Path) -> None:
+    path = tmp_path / "table_3_1.json"
+
+    def row(model: str, mean: float, metric: str = "accuracy") -> dict[str, object]:
+        return {"row": "clean", "model": model, "metric": metric, "mean": mean}
+
+    record_table(path, "3.1", "HAR", [row("a", 1.0), row("b", 2.0)], preset="paper")
+    new = [row("b", 3.0), row("b", 4.0, "gate_auroc_pooled")]
+    record_table(path, "3.1", "HAR", new, preset="paper")
+    held = json.loads(path.read_text())
+    bare = [{k: v for k, v in r.items() if k not in ("command", "git")} for r in held["rows"]]
+    assert bare == [row("a", 1.0), *new]
+    assert all(r["command"].startswith("python ") for r in held["rows"])
+    assert (held["table"], held["title"], held["preset"]) == ("3.1", "HAR", "paper")
+    assert {"command", "git", "versions", "device", "date"} <= set(held)
+
+
+def test_the_command_names_no_folder_of_the_user(monkeypatch: pytest.MonkeyPatch) -> None:
+    script = str(repository.ROOT / "scripts" / "train_argate.py")
+    monkeypatch.setattr(sys, "argv", [script, "--data-dir", "/home/me/data", "--model", "argate_l"])
+    wanted = "python scripts/train_argate.py --data-dir $FUSION_DATA_DIR --model argate_l"
+    assert command_line() == wanted
+    monkeypatch.setattr(sys, "argv", [script, "--only", "tuned, gamma", "--out", "/home/me/runs/y"])
+    assert command_line().endswith("--only 'tuned, gamma' --out PATH/y")
+
+
+def test_result_line_and_failure(capsys: pytest.CaptureFixture[str]) -> None:
+    print_result(model="argate_l", accuracy=97.65432, runs=3)
+    assert capsys.readouterr().out == "result: model=argate_l accuracy=97.65 runs=3\n"
+    with pytest.raises(SystemExit) as left:
+        fail("n_clean=9")
+    assert left.value.code == 2
+    assert capsys.readouterr().err == "error: n_clean=9\n"

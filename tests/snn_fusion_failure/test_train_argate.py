@@ -1,0 +1,242 @@
+"""The fusion scripts on simulated windows: they run, resume, refuse, and their tables add up."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+from fusion.data import load
+from snn_fusion_failure.commands import train_argate
+from snn_fusion_failure.commands.train_argate import Config
+from snn_fusion_failure.records import fusion_tables
+from snn_fusion_failure.records.fusion_tables import Row, Run
+from snn_fusion_failure.runs import repository, write_json
+from tests._scripts import load_script
+
+reproduce = load_script("studies/reproduce")
+study_argate = load_script("studies/study_argate")
+
+# optax's Adam raises a float to an integer power, which strict promotion forbids.
+pytestmark = pytest.mark.relaxed
+
+SMALL = Config(dataset="simulated", model="argate_l", epochs=2)
+
+
+@pytest.fixture(scope="module")
+def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Config, dict[str, Any]]:
+    import jax
+
+    config = dataclasses.replace(SMALL, out=tmp_path_factory.mktemp("runs") / "argate")
+    with jax.numpy_dtype_promotion("standard"):
+        return config, train_argate.main(config)
+
+
+def test_a_run_leaves_numbers_and_pictures(
+    run: tuple[Config, dict[str, Any]], capsys: pytest.CaptureFixture[str]
+) -> None:
+    config, summary = run
+    assert config.out is not None
+    names = {"config.json", "metrics.jsonl", "result.json", "confusion.png", "training.png"}
+    assert names | {"gate.png", "checkpoints"} <= {p.name for p in config.out.iterdir()}
+    result = json.loads((config.out / "result.json").read_text())
+    assert result["accuracy"] == summary["accuracy"]
+    assert 25.0 < result["accuracy"] <= 100.0  # four classes, even after two epochs
+    assert sum(map(sum, result["confusion"])) == 1024
+    third = (result["accuracy_clean"] + 2 * result["accuracy_corrupted"]) / 3
+    assert result["accuracy"] == pytest.approx(third, abs=0.2)
+    assert result["rows"] == "test"
+    assert {"command", "git", "versions"} <= set(result["provenance"])
+    lines = (config.out / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["epoch"] for line in lines] == [1, 2]
+
+
+def test_a_run_folder_is_not_written_twice(run: tuple[Config, dict[str, Any]]) -> None:
+    config, summary = run
+    with pytest.raises(ValueError, match=r"already holds a run; pass --resume"):
+        train_argate.main(config)
+    changed = dataclasses.replace(config, resume=True, seed=5)
+    with pytest.raises(ValueError, match=r"other settings \(seed: 0 -> 5\)"):
+        train_argate.main(changed)
+    # Resuming a finished run trains no further: the same network, scored again.
+    again = train_argate.main(dataclasses.replace(config, resume=True))
+    assert again["accuracy"] == summary["accuracy"]
+    assert config.out is not None
+    assert len((config.out / "metrics.jsonl").read_text().splitlines()) == 2
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        ({"dataset": "kitty"}, r"'kitty' is unknown, expected one of .*'simulated'"),
+        ({"model": "argate"}, r"'argate' is not known; known: baseline, netgated"),
+        ({"kind": "fog"}, r"'fog' is unknown, expected one of uniform, gaussian"),
+        ({"preset": "best"}, r"'best' is not known; known: quick, paper"),
+        ({"n_clean": 7}, r"n_clean.*7"),
+        ({"protocol": "generalisation", "test_range": (3, 8)}, r"\(3, 8\)|8"),
+        ({"epochs": 0}, r"epochs=0: expected at least 1"),
+    ],
+)
+def test_bad_settings_are_refused_before_a_folder_is_made(
+    change: dict[str, Any], message: str, tmp_path: Path
+) -> None:
+    config = dataclasses.replace(SMALL, out=tmp_path / "run", **change)
+    with pytest.raises(ValueError, match=message):
+        train_argate.main(config)
+    assert not (tmp_path / "run").exists()
+
+
+def test_options_reach_the_settings() -> None:
+    data = load("simulated")
+    config = Config(
+        dataset="simulated",
+        normalizer="softmax_sigmoid",
+        epochs=3,
+        learning_rate=0.1,
+        alpha=0.2,
+        beta=0.3,
+        tau=0.4,
+        protocol="generalisation",
+        train_range=(1, 2),
+        test_range=(3, 5),
+        kind="gaussian",
+        redraw=False,
+    )
+    settings, corruption = train_argate.build(config, data)
+    assert settings.model.normalizer == "softmax_sigmoid"
+    assert (settings.train.epochs, settings.hyper.learning_rate) == (3, 0.1)
+    assert settings.hyper.loss[:3] == (0.2, 0.3, 0.4)
+    assert (corruption.kind, corruption.redraw) == ("gaussian", False)
+    assert corruption.train != corruption.test
+
+
+TINY = {
+    "3.1": (
+        "Made up",
+        (
+            Row(
+                "n_clean=1 uniform",
+                {"dataset": "simulated", "n_clean": 1, "epochs": 2},
+                channel="sensor_2",
+            ),
+        ),
+    )
+}
+
+
+def test_reproduce_goes_on_where_it_was(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setattr(_fusion_tables, "TABLES", TINY)
+    config = reproduce.Config(
+        table=("3.1",),
+        preset="quick",
+        seeds=1,
+        models=("argate_l",),
+        out=tmp_path / "runs",
+        results=tmp_path / "results",
+    )
+    reproduce.main(config)
+    assert "result: tables=3.1 runs=1" in capsys.readouterr().out
+    table = json.loads((tmp_path / "results" / "table_3_1.json").read_text())
+    cell = next(row for row in table["rows"] if row["metric"] == "accuracy")
+    source = json.loads((repository.RESULTS / "source_tables.json").read_text())["3.1"]
+    assert cell["source"] == source["rows"]["n_clean=1 uniform"][-1]
+    path = tmp_path / "runs" / "3.1" / "n_clean=1_uniform" / "argate_l" / "0.json"
+    record = json.loads(path.read_text())
+    assert cell["values"] == [record["accuracy"]]
+    corrupted = round(1024 * 2 / 3)
+    weights = record["channel"]
+    assert len(weights["when_failed"]) + len(weights["when_clean"]) in (corrupted, corrupted + 1)
+
+    reproduce.main(config)
+    assert "runs=0" in capsys.readouterr().out
+    assert json.loads(path.read_text()) == record
+
+
+@pytest.mark.parametrize("shard", ["2/2", "a", "1"])
+def test_shards_are_checked(shard: str) -> None:
+    with pytest.raises(ValueError, match=f"shard='{shard}'"):
+        reproduce.main(reproduce.Config(shard=shard))
+    with pytest.raises(ValueError, match=r"\['9.9'\] are not known; known: 2.3"):
+        reproduce.main(reproduce.Config(table=("9.9",)))
+
+
+def test_every_run_has_a_file_and_a_number_of_the_source() -> None:
+    source = json.loads((repository.RESULTS / "source_tables.json").read_text())
+    paths = []
+    for table, (_, rows) in fusion_tables.TABLES.items():
+        assert [row.name for row in rows] == list(source[table]["rows"])
+        paths += [run.path(Path()) for run in fusion_tables.runs(table, 2)]
+    # Rows x models and references, for two seeds.
+    assert len(set(paths)) == len(paths) == 2 * (43 + 10 + 15 + 10 + 43 + 5)
+
+
+def test_a_table_pairs_runs_by_seed(tmp_path: Path) -> None:
+    accuracy = {
+        "baseline": [60.0, 70.0, 65.0],
+        "argate_plus": [64.0, 75.0, 68.0],
+        "argate_l": [64.0, 76.0],
+        "embracenet": [58.0],
+    }
+    row = fusion_tables.TABLES["3.1"][1][5]
+    for model, values in accuracy.items():
+        for seed, value in enumerate(values):
+            record = dict.fromkeys(fusion_tables.METRICS, 0.5) | {"accuracy": value}
+            if model == "baseline":
+                record["gate_auroc_pooled"] = None
+            write_json(Run("3.1", row, model, seed).path(tmp_path), record)
+    source = json.loads((repository.RESULTS / "source_tables.json").read_text())
+    rows, studies = fusion_tables.collect("3.1", tmp_path, 3, source)
+    held = {(r["model"], r["metric"]): r for r in rows}
+    assert held["argate_plus", "accuracy"]["mean"] == 69.0
+    assert held["argate_plus", "accuracy"]["source"] == source["3.1"]["rows"][row.name][3]
+    assert held["embracenet", "accuracy"]["ci95"] is None
+    assert "source" not in held["embracenet", "accuracy"]
+    assert ("baseline", "gate_auroc_pooled") not in held
+    found = {s["comparison"]: s for s in studies}
+    assert found["argate_plus - baseline"]["difference"] == 4.0
+    # Only the two seeds that both have.
+    assert found["argate_l - argate_plus"]["difference"] == 0.5
+    assert found["argate_l - argate_plus"]["n"] == 2
+
+
+def test_the_study_changes_one_setting_at_a_time(tmp_path: Path) -> None:
+    listed = study_argate.variants(study_argate.Config())
+    assert len(listed) <= 24
+    assert len({v.path(tmp_path) for v in listed}) == len(listed)
+    base = train_argate.build(Config(dataset="simulated"), load("simulated"))
+    assert study_argate.change(*base, {}) == base
+    for variant in listed:
+        # Every change changes something, and can be built.
+        assert (study_argate.change(*base, dict(variant.changes)) == base) == (
+            not variant.changes
+        ), variant
+    with pytest.raises(ValueError, match=r"\['depth'\] are not known; known: normalizer"):
+        study_argate.change(*base, {"depth": 3})
+    with pytest.raises(ValueError, match=r"\['oracle'\] are not in the study"):
+        study_argate.variants(study_argate.Config(models=("oracle",)))
+
+
+def test_the_study_collects_what_is_there(tmp_path: Path) -> None:
+    config = study_argate.Config(
+        models=("argate_ws", "baseline"),
+        seeds=2,
+        out=tmp_path / "runs",
+        results=tmp_path,
+        collect_only=True,
+    )
+    for i, variant in enumerate(study_argate.variants(config)[:4]):
+        record = dict.fromkeys(fusion_tables.METRICS, 0.5) | {"accuracy": 70.0 + i}
+        write_json(variant.path(config.out), record)
+    study_argate.main(config)
+    rows = json.loads((tmp_path / "study_argate.json").read_text())["rows"]
+    accuracy = {(r["row"], r["model"]): r["values"] for r in rows if r["metric"] == "accuracy"}
+    assert accuracy == {
+        ("har: preset", "baseline"): [70.0, 73.0],
+        ("har: redraw=False", "baseline"): [71.0],
+        ("har: preset", "argate_ws"): [72.0],
+    }

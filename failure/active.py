@@ -16,14 +16,14 @@ __all__ = ["Activity", "activity", "by_transistor"]
 
 
 class Activity(NamedTuple):
-    """Result of :func:`activity`.
+    """Result of `activity`.
 
     Attributes:
-        weights: ``[D]``, mean fusion weight of every feature.
-        order: ``[D]``, features by falling weight.
+        weights: `[D]`, mean fusion weight of every feature.
+        order: `[D]`, features by falling weight.
         n_active: how many of them are active.
-        sensitivity: ``[D, D]``, share of parameter j in feature k; rows sum to one.
-        parameters: ``[D]``, weight of every parameter, the sum is one.
+        sensitivity: `[D, D]`, share of parameter j in feature k; rows sum to one.
+        parameters: `[D]`, weight of every parameter, the sum is one.
     """
 
     weights: np.ndarray
@@ -52,13 +52,13 @@ def activity(
         config: of the trained network.
         params: its weights.
         x: inputs, unit variance.
-        share: rule of the active features, see :func:`failure.rev_argate.active_features`.
+        share: rule of the active features, see `failure.rev_argate.active_features`.
         rows: rows that the Jacobian is averaged over.
 
     Returns:
         Activity.
 
-    Source: M. S. Shim (2020), Section 4.3, for the ranking by fusion weights. Deviation: the source
+    Source: Shim (2020), Section 4.3, for the ranking by fusion weights. Deviation: the source
     names active features only; the step from features to transistors is ours.
     """
     of_rows = fusion_weights(config, params, x)

@@ -30,7 +30,7 @@ __all__ = [
 class BNNConfig:
     """Size, prior and training of the network.
 
-    ``prior_scale`` is the standard deviation of a weight times the square root of its fan-in.
+    `prior_scale` is the standard deviation of a weight times the square root of its fan-in.
     """
 
     hidden: int = 64
@@ -44,8 +44,8 @@ class BNNConfig:
 class BNNParams(NamedTuple):
     """Variational posterior: mean and log standard deviation of every weight, observation noise.
 
-    ``weights`` and ``log_sd`` are tuples ``(w1 [i, h], b1 [h], w2 [h, o], b2 [o])``; inputs and
-    outputs are standardised with ``x_shift, x_scale, y_shift, y_scale``.
+    `weights` and `log_sd` are tuples `(w1 [i, h], b1 [h], w2 [h, o], b2 [o])`; inputs and
+    outputs are standardised with `x_shift, x_scale, y_shift, y_scale`.
     """
 
     weights: tuple[Array, Array, Array, Array]
@@ -58,7 +58,7 @@ class BNNParams(NamedTuple):
 
 
 class LinearPosterior(NamedTuple):
-    """Conjugate linear regression: ``mean [i+1, o]``, ``covariance [i+1, i+1]``, noise ``[o]``."""
+    """Conjugate linear regression: `mean [i+1, o]`, `covariance [i+1, i+1]`, noise `[o]`."""
 
     mean: Array
     covariance: Array
@@ -169,14 +169,14 @@ def fit(
     Args:
         key: random key.
         config: sizes and training.
-        x: inputs ``z_act``.
-        y: targets ``z_inact``.
+        x: inputs `z_act`.
+        y: targets `z_inact`.
 
     Returns:
-        ``(posterior, negative ELBO of every step)``.
+        `(posterior, negative ELBO of every step)`.
 
     Raises:
-        ValueError: rows of ``x`` and ``y`` differ, or fewer than 2.
+        ValueError: rows of `x` and `y` differ, or fewer than 2.
     """
     key_init, key_fit = jax.random.split(key)
     params = init(key_init, config, x, y)
@@ -220,7 +220,7 @@ def sample(
 def predict(params: BNNParams, x: Float[Array, "n i"]) -> Float[Array, "n o"]:
     """Output at the posterior mean of the weights: deterministic, as a restoration needs it.
 
-    The mean over :func:`sample` differs by the curvature of the hidden layer only.
+    The mean over `sample` differs by the curvature of the hidden layer only.
     """
     w1, b1, w2, b2 = params.weights
     scaled = (x - params.x_shift[None]) / params.x_scale[None]

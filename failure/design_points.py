@@ -23,7 +23,7 @@ def merge_points(
     """One point per direction: nearest to the origin first, others dropped when alike or far.
 
     Args:
-        points: ``[k, D]``.
+        points: `[k, D]`.
         cosine: two points are alike above this cosine.
         excess: points farther out than the nearest by this many sigma are dropped.
         most: points kept at most.
@@ -56,20 +56,20 @@ def design_points(
 
     .. math:: u' = \frac{\nabla y \cdot u - (y - T)}{|\nabla y|^2} \nabla y
 
-    damped so that :math:`\tfrac12 |u|^2 + c\,|y - T|` falls. Without ``gradient`` forward
+    damped so that :math:`\tfrac12 |u|^2 + c\,|y - T|` falls. Without `gradient` forward
     differences are used, D + 1 simulations per step.
 
     Args:
-        performance: ``x [m, D] -> y [m]``.
-        threshold: failure is ``y > threshold``.
+        performance: `x [m, D] -> y [m]`.
+        threshold: failure is `y > threshold`.
         failures: failing points, for example those that a search found.
-        gradient: ``x [m, D] -> dy/dx [m, D]``, counted as one simulation per row.
+        gradient: `x [m, D] -> dy/dx [m, D]`, counted as one simulation per row.
         iterations: steps at most.
         step: of the forward differences [sigma].
         tolerance: stop when a step moves every point by less [sigma].
 
     Returns:
-        ``(points [k', D], merged, just inside the failure region; simulations used)``.
+        `(points [k', D], merged, just inside the failure region; simulations used)`.
 
     Raises:
         ValueError: a point that does not fail, named by its row.
@@ -133,7 +133,7 @@ def _slopes(
     y: np.ndarray,
     step: float,
 ) -> np.ndarray:
-    """Gradients at the rows of ``u``; the given one or forward differences."""
+    """Gradients at the rows of `u`; the given one or forward differences."""
     if gradient is not None:
         with jax.enable_x64(True):
             return np.nan_to_num(np.asarray(gradient(jnp.asarray(u))))

@@ -25,7 +25,7 @@ def plot_trend(
 
     Args:
         path: file to write.
-        outputs: method -> ``y [S, n]``, larger is worse.
+        outputs: method -> `y [S, n]`, larger is worse.
         threshold: drawn as a line.
         n_init: end of the initial design.
         label: of the vertical axis.
@@ -57,8 +57,8 @@ def plot_activity(
 
     Args:
         path: file to write.
-        names: ``(transistor, quantity)`` of every parameter.
-        values: ``[D]``, such as a failure point in sigma.
+        names: `(transistor, quantity)` of every parameter.
+        values: `[D]`, such as a failure point in sigma.
         title: of the picture.
     """
     transistors = list(dict.fromkeys(name for name, _ in names))

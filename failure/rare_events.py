@@ -51,7 +51,7 @@ class Estimate(NamedTuple):
 
 
 def _log_normal_interval(mean: float, error: float, factor: float) -> tuple[float, float]:
-    """Interval of a positive estimate with standard error ``error``, symmetric in its logarithm."""
+    """Interval of a positive estimate with standard error `error`, symmetric in its logarithm."""
     spread = factor * math.sqrt(math.log1p((error / mean) ** 2))
     return mean * math.exp(-spread), min(1.0, mean * math.exp(spread))
 
@@ -65,15 +65,15 @@ def monte_carlo(
     n: int = 10_000,
     batch: int = 10_000,
 ) -> Estimate:
-    """Share of failures among ``n`` draws, with the exact binomial interval.
+    """Share of failures among `n` draws, with the exact binomial interval.
 
     Args:
         key: random key.
-        performance: ``x [m, dim] -> y [m]``.
-        threshold: failure is ``y > threshold``.
+        performance: `x [m, dim] -> y [m]`.
+        threshold: failure is `y > threshold`.
         dim: number of parameters.
         n: draws.
-        batch: draws per call of ``performance``.
+        batch: draws per call of `performance`.
 
     Source: Clopper and Pearson (1934) for the interval.
     """
@@ -111,7 +111,7 @@ def _one_subset_run(
     max_levels: int,
     key: Array,
 ) -> tuple[Array, Array, Array]:
-    """One replicate: ``(log probability, simulations, invalid outputs)``."""
+    """One replicate: `(log probability, simulations, invalid outputs)`."""
     n_chains = round(n * share)
     length = n // n_chains
 
@@ -192,24 +192,24 @@ def subset_simulation(
     .. math:: p = \prod_j P(y > b_{j+1} \mid y > b_j), \qquad
         u' = \sqrt{1 - s^2}\, u + s\, \xi
 
-    with the levels :math:`b_j` set so that each factor is ``share`` and :math:`u'` the conditional
+    with the levels :math:`b_j` set so that each factor is `share` and :math:`u'` the conditional
     moves of the Markov chains. The chains of one run are correlated in ways a formula for the
     error underestimates, so the interval comes from independent replicates (Student's t on the
     log-normal scale).
 
     Args:
         key: random key.
-        performance: ``x [m, dim] -> y [m]``, jittable (wrap others in ``jax.pure_callback``) and
+        performance: `x [m, dim] -> y [m]`, jittable (wrap others in `jax.pure_callback`) and
             hashable, as functions are: its program is compiled once and kept.
-        threshold: failure is ``y > threshold``.
+        threshold: failure is `y > threshold`.
         dim: number of parameters.
         n: samples per level and replicate.
         share: conditional probability of a level.
         replicates: independent runs, at least 3.
-        max_levels: ladder's length at most; ``share ** max_levels`` is the least probability seen.
+        max_levels: ladder's length at most; `share ** max_levels` is the least probability seen.
 
     Raises:
-        ValueError: fewer than 3 replicates, or ``n * share`` below 10.
+        ValueError: fewer than 3 replicates, or `n * share` below 10.
 
     Source: Au and Beck (2001); Papaioannou et al. (2015) for the moves. Deviation: replicates in
     the place of the analytic coefficient of variation.
@@ -254,10 +254,10 @@ def importance_sampling(
 
     Args:
         key: random key.
-        performance: ``x [m, D] -> y [m]``.
-        threshold: failure is ``y > threshold``.
+        performance: `x [m, D] -> y [m]`.
+        threshold: failure is `y > threshold`.
         points: the shifts :math:`\mu_k`, best the most likely point of each region
-            (:func:`design_points`).
+            (`design_points`).
         n: samples.
         defensive: :math:`\alpha`.
 

@@ -78,8 +78,8 @@ class RevArgateConfig:
 class RevArgateParams(NamedTuple):
     """Weights of the RevNet, the K = D feature paths, gate, main and auxiliary heads, targets.
 
-    ``paths`` is ``(slope [K, F], offset [K, F])``, ``head`` is ``(w [K F], b [])`` and
-    ``aux_heads`` is ``(w [K, F], b [K])``.
+    `paths` is `(slope [K, F], offset [K, F])`, `head` is `(w [K F], b [])` and
+    `aux_heads` is `(w [K, F], b [K])`.
     """
 
     network: revnet.RevNetParams
@@ -91,7 +91,7 @@ class RevArgateParams(NamedTuple):
 
 
 def init(key: Key[Array, ""], config: RevArgateConfig, dim: int) -> RevArgateParams:
-    """Random weights for ``dim`` inputs; the gate starts at equal weights."""
+    """Random weights for `dim` inputs; the gate starts at equal weights."""
     keys = jax.random.split(key, 6)
     width = config.feature_width
     gate = Gate(config.gate_width, "softmax")
@@ -109,7 +109,7 @@ def init(key: Key[Array, ""], config: RevArgateConfig, dim: int) -> RevArgatePar
 
 
 def _features(params: RevArgateParams, x: Array) -> Array:
-    """Paths behind the RevNet's features, ``[K, n, F]``."""
+    """Paths behind the RevNet's features, `[K, n, F]`."""
     # Six blocks of a few hundred rows: to keep them is cheaper than to undo them.
     z = revnet.forward_stored(params.network, x)
     slope, offset = params.paths
@@ -127,7 +127,7 @@ def fusion_weights(
 def predict(
     config: RevArgateConfig, params: RevArgateParams, x: Float[Array, "n d"]
 ) -> Float[Array, " n"]:
-    """Standardised output of the main model; ``x`` in units of its standard deviation."""
+    """Standardised output of the main model; `x` in units of its standard deviation."""
     features = _features(params, x)
     weights: Array = Gate(config.gate_width, "softmax").apply(params.gate, features)  # type: ignore[assignment]
     w, b = params.head
@@ -150,16 +150,16 @@ def loss(
     with squared errors, means over the rows, and :math:`f_k` falling in its own loss.
 
     Args:
-        config: :math:`\alpha, \beta, \tau` and :math:`\lambda` = ``anchor``.
+        config: :math:`\alpha, \beta, \tau` and :math:`\lambda` = `anchor`.
         params: all weights.
         x: inputs, unit variance.
         y: standardised outputs.
         mask: 1 for rows that count.
 
     Returns:
-        ``(loss, main part)``.
+        `(loss, main part)`.
 
-    Source: M. S. Shim (2020), Equation 4.6. Deviation: the auxiliary losses are means over the
+    Source: Shim (2020), Eq. 4.6. Deviation: the auxiliary losses are means over the
     data (a feature's relevance is a property of the circuit, not of one sample), no gradient
     passes from the targets back into them, and the anchor term keeps learned targets from merely
     copying the weights.
@@ -194,7 +194,7 @@ def fit(
     """Train by Adam on all rows, one scan; lattices are projected after every step.
 
     Returns:
-        ``(params, main loss of every step)``.
+        `(params, main loss of every step)`.
     """
     params = init(key, config, x.shape[1])
     schedule = optax.cosine_decay_schedule(config.learning_rate, config.steps)
@@ -228,11 +228,11 @@ def fit(
 def active_features(weights: Float[Array, "n d"], share: float | None = None) -> tuple[Any, int]:
     """Features ranked by mean fusion weight, and how many of them are active.
 
-    The rule: the fewest features whose weights sum to ``share``; one half without. (The source
+    The rule: the fewest features whose weights sum to `share`; one half without. (The source
     keeps the top N and does not say how N is chosen.)
 
     Returns:
-        ``(order [D], best first; N)``.
+        `(order [D], best first; N)`.
 
     Example:
         >>> order, n = active_features(jnp.asarray([[0.1, 0.6, 0.3]]), 0.8)
@@ -260,7 +260,7 @@ def check_active(
     The source's second step: where the two are alike, the active features carry the target.
 
     Returns:
-        ``(RMSE on z_act, RMSE on z)`` of the last fifth of the rows, outputs standardised.
+        `(RMSE on z_act, RMSE on z)` of the last fifth of the rows, outputs standardised.
     """
     cut = max(1, z.shape[0] // 5)
     errors = []
@@ -297,7 +297,7 @@ def make_space(
         y: outputs, NaN where invalid.
 
     Returns:
-        ``(space, mean fusion weight of every feature)``.
+        `(space, mean fusion weight of every feature)`.
     """
     key_fit, key_bnn = jax.random.split(key)
     x_scale = jnp.asarray(unit_scale(task) / math.sqrt(12.0), x.dtype)

@@ -12,14 +12,14 @@ __all__ = ["RevNetParams", "forward", "forward_stored", "init", "inverse"]
 
 
 class RevNetParams(NamedTuple):
-    """Weights of ``depth`` blocks, stacked on the leading axis; ``m = ceil(D / 2)``.
+    """Weights of `depth` blocks, stacked on the leading axis; `m = ceil(D / 2)`.
 
     Attributes:
-        k1: ``[depth, width, m]``, drives ``u``.
-        b1: ``[depth, width]``.
-        k2: ``[depth, width, m]``, drives ``v``.
-        b2: ``[depth, width]``.
-        step: ``[depth]``, the time step h of every block.
+        k1: `[depth, width, m]`, drives `u`.
+        b1: `[depth, width]`.
+        k2: `[depth, width, m]`, drives `v`.
+        b2: `[depth, width]`.
+        step: `[depth]`, the time step h of every block.
     """
 
     k1: Array
@@ -45,9 +45,9 @@ def init(
         key: random key.
         dim: D, the number of inputs (odd or even).
         depth: N, the number of blocks.
-        width: rows of K; ``ceil(D / 2)`` (square K) without.
+        width: rows of K; `ceil(D / 2)` (square K) without.
         step: h.
-        scale: standard deviation of the entries of K times ``sqrt(m)``.
+        scale: standard deviation of the entries of K times `sqrt(m)`.
         dtype: of the weights; the default float without.
 
     Raises:
@@ -68,7 +68,7 @@ def init(
 
 
 def _drive(k: Array, b: Array, x: Array, size: int) -> Array:
-    r""":math:`K^\top \sigma(K x + b)`; ``x`` is padded and the result cut for an odd split."""
+    r""":math:`K^\top \sigma(K x + b)`; `x` is padded and the result cut for an odd split."""
     m = k.shape[-1]
     if x.shape[-1] < m:
         x = jnp.concatenate([x, jnp.zeros((*x.shape[:-1], m - x.shape[-1]), x.dtype)], -1)
@@ -100,7 +100,7 @@ def _split(params: RevNetParams, x: Array) -> tuple[Array, Array]:
 
 
 def forward_stored(params: RevNetParams, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
-    """:func:`forward` with JAX's own reverse rule, which stores every block's activations."""
+    """`forward` with JAX's own reverse rule, which stores every block's activations."""
     (u, v), _ = jax.lax.scan(lambda c, block: (_block(block, *c), None), _split(params, x), params)
     return jnp.concatenate([u, v], -1)
 
@@ -118,14 +118,14 @@ def forward(params: RevNetParams, x: Float[Array, "*b d"]) -> Float[Array, "*b d
     the depth.
 
     Args:
-        params: weights; :math:`h` is ``params.step``.
+        params: weights; :math:`h` is `params.step`.
         x: inputs, any leading axes.
 
     Returns:
-        z, with the shape of ``x``.
+        z, with the shape of `x`.
 
-    Source: M. S. Shim (2020), Equations 4.4 and 4.5; Gomez et al. (2017) for the reverse rule.
-    Deviation: for odd D, ``u`` has one entry more than ``v``; ``v`` is padded with a zero inside
+    Source: Shim (2020), Eq. 4.4 and 4.5; Gomez et al. (2017) for the reverse rule.
+    Deviation: for odd D, `u` has one entry more than `v`; `v` is padded with a zero inside
     K and the surplus entry of its update is dropped, which keeps the map invertible on R^D.
 
     Example:
@@ -140,7 +140,7 @@ def forward(params: RevNetParams, x: Float[Array, "*b d"]) -> Float[Array, "*b d
 def inverse(params: RevNetParams, z: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
     r"""Map features back to inputs, :math:`x = g^{-1}(z)`: the blocks undone in reverse order.
 
-    Source: M. S. Shim (2020), Equation 4.5.
+    Source: Shim (2020), Eq. 4.5.
     """
     (u, v), _ = jax.lax.scan(
         lambda c, block: (_unblock(block, *c), None), _split(params, z), params, reverse=True

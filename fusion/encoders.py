@@ -1,6 +1,6 @@
 """Unisensory encoders: one small network per sensor, all of them computed as one batched matmul.
 
-Every array has the sensor (branch) axis first, ``[branch, batch, ...]``: the K encoders are then a
+Every array has the sensor (branch) axis first, `[branch, batch, ...]`: the K encoders are then a
 single batched matrix product, which on a CPU is several times faster than K convolutions, and many
 times faster inside `jax.lax.scan`, where XLA's CPU convolution is slow.
 """
@@ -43,7 +43,7 @@ class EncoderConfig:
         frequencies: number of octaves of the Fourier features of a scalar (scalars only).
         levels: sorted readings that each sensor gave in training, one tuple per sensor (scalars
             only); adds the distance to the nearest of them, see `reading_levels`. Empty for none.
-        backend: how `conv1d` is computed; ``"matmul"`` for CPU, ``"conv"`` for accelerators.
+        backend: how `conv1d` is computed; `"matmul"` for CPU, `"conv"` for accelerators.
     """
 
     features: int = 64
@@ -77,15 +77,15 @@ def conv1d(
     .. math:: y_{k,b,i,f} = b_{k,f} + \sum_{j,c} x_{k,b,is+j,c}\, W_{k,j,c,f}
 
     Args:
-        x: K batches of series, ``[branch, batch, time, channel]``.
-        kernel: ``[branch, width, channel, feature]``.
-        bias: ``[branch, feature]``.
+        x: K batches of series, `[branch, batch, time, channel]`.
+        kernel: `[branch, width, channel, feature]`.
+        bias: `[branch, feature]`.
         stride: step s between outputs, in samples.
-        backend: ``"matmul"`` gathers the windows and multiplies (fast inside `scan` on a CPU);
-            ``"conv"`` calls XLA's grouped convolution. Both give the same numbers to rounding.
+        backend: `"matmul"` gathers the windows and multiplies (fast inside `scan` on a CPU);
+            `"conv"` calls XLA's grouped convolution. Both give the same numbers to rounding.
 
     Returns:
-        ``[branch, batch, (time - width) // stride + 1, feature]``.
+        `[branch, batch, (time - width) // stride + 1, feature]`.
     """
     k, b, t, c = x.shape
     _, w, _, f = kernel.shape
@@ -121,7 +121,7 @@ def _he(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> A
 def stacked_dense(
     module: nn.Module, name: str, x: Float[Array, "k b i"], features: int, scale: float = 1.0
 ) -> Float[Array, "k b f"]:
-    """A dense layer per branch with parameters ``name_kernel`` and ``name_bias`` of `module`."""
+    """A dense layer per branch with parameters `name_kernel` and `name_bias` of `module`."""
     k, _, i = x.shape
     kernel = module.param(f"{name}_kernel", lambda key: scale * _he(key, (k, i, features)))
     bias = module.param(f"{name}_bias", nn.initializers.zeros, (k, features))
@@ -170,7 +170,7 @@ def spectral_features(x: Float[Array, "k b t"]) -> Float[Array, "k b f"]:
 class SeriesEncoder(nn.Module):
     """Encode windows of K sensors: two strided convolutions beside a log-spectrum path.
 
-    ``[branch, batch, time] -> [branch, batch, features]``. The convolutions see the series without
+    `[branch, batch, time] -> [branch, batch, features]`. The convolutions see the series without
     its mean (their mean and maximum over time are kept); level and spread come from the moments.
     """
 
@@ -228,7 +228,7 @@ class ScalarEncoder(nn.Module):
 
     .. math:: \phi(x) = (x, \sin 2^{m}\pi x, \cos 2^{m}\pi x), \; m = -1 \ldots M-2
 
-    ``[branch, batch, 1] -> [branch, batch, features]``. A scalar that takes few or unevenly spread
+    `[branch, batch, 1] -> [branch, batch, features]`. A scalar that takes few or unevenly spread
     values is not separable by a narrow network on the value itself; octaves of it are.
     """
 

@@ -120,7 +120,7 @@ def auroc(positive: Num[ArrayLike, " p"], negative: Num[ArrayLike, " q"]) -> flo
 
     .. math:: A = \frac{1}{pq} \sum_{i,j} \left([a_i > b_j] + \tfrac12 [a_i = b_j]\right)
 
-    Symbols: :math:`a` is ``positive`` (p scores), :math:`b` is ``negative`` (q scores).
+    Symbols: :math:`a` is `positive` (p scores), :math:`b` is `negative` (q scores).
 
     Returns:
         A value in [0, 1]: the chance that a random positive scores above a random negative; NaN
@@ -213,7 +213,7 @@ def gap_closure(
 
     .. math:: g = \frac{\bar a - \bar b}{\bar o - \bar b}
 
-    Symbols: :math:`a, b, o` are the accuracies of ``model``, ``baseline`` and ``oracle`` (a gate
+    Symbols: :math:`a, b, o` are the accuracies of `model`, `baseline` and `oracle` (a gate
     that is told which channels failed); bars are means over seeds.
 
     Returns:
@@ -274,7 +274,7 @@ def mean_interval(values: Sequence[float] | ArrayLike, *, level: float = 0.95) -
 
     .. math:: \bar x \pm t_{n-1, (1 + p) / 2}\, s / \sqrt n
 
-    Symbols: :math:`p` is ``level``; :math:`s` is the standard deviation with n - 1 in the divisor.
+    Symbols: :math:`p` is `level`; :math:`s` is the standard deviation with n - 1 in the divisor.
 
     Raises:
         ValueError: fewer than two values, non-finite values, or `level` outside (0, 1).

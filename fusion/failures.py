@@ -98,7 +98,7 @@ def fixed_failing(
     Raises:
         ValueError: an unknown, repeated or no name; the message lists the known channels.
 
-    Source: dissertation, section 3.3.3.2, fixed failing sensor assignment.
+    Source: Shim (2020), section 3.3.3.2, fixed failing sensor assignment.
 
     Example:
         >>> fixed_failing(("a", "b", "c"), ("c", "a")).failing
@@ -121,7 +121,7 @@ def random_failing(
     Raises:
         ValueError: `n_clean` outside 0..K-1.
 
-    Source: dissertation, section 3.3.3.2, random failing sensor assignment.
+    Source: Shim (2020), section 3.3.3.2, random failing sensor assignment.
 
     Example:
         >>> random_failing(("a", "b", "c"), n_clean=1).low
@@ -151,7 +151,7 @@ def generalisation(
     Raises:
         ValueError: a range that does not lie in 1..K.
 
-    Source: dissertation, section 3.3.3.2 and Tables 3.3 and 3.6, failing sensor generation test.
+    Source: Shim (2020), section 3.3.3.2 and Tables 3.3 and 3.6, failing sensor generation test.
     """
     k = len(channels)
     for part, (low, high) in (("train", train), ("test", test)):
@@ -285,17 +285,17 @@ def apply_failure(
 
     .. math:: x'_{nkt} = x_{nkt} + m_{nk}\, s\, (f_{nkt}(x) - x_{nkt})
 
-    Symbols: :math:`m` is ``mask``; :math:`s` is ``severity`` in [0, 1]; :math:`f` is the reading of
+    Symbols: :math:`m` is `mask`; :math:`s` is `severity` in [0, 1]; :math:`f` is the reading of
     a channel that has failed wholly:
 
-    - ``uniform``: U(-1, 1), ``gaussian``: N(0, 1), independent for each sample (the source's two);
-    - ``zero``: 0, the middle of the channel's range;
-    - ``stuck``: the last reading before a time uniform in the window; with T = 1 the reading of
+    - `uniform`: U(-1, 1), `gaussian`: N(0, 1), independent for each sample (the source's two);
+    - `zero`: 0, the middle of the channel's range;
+    - `stuck`: the last reading before a time uniform in the window; with T = 1 the reading of
       another row of the batch;
-    - ``drift``: a ramp from a random onset that would reach 0.5 to 2 (either sign) in a window;
-    - ``dropout``: three bursts of 10 to 30 % of the window read 0 (49 % of samples on average);
-    - ``gain``: times 2 to 4, or divided by it;
-    - ``clip``: saturated at a rail between 0 and 0.2.
+    - `drift`: a ramp from a random onset that would reach 0.5 to 2 (either sign) in a window;
+    - `dropout`: three bursts of 10 to 30 % of the window read 0 (49 % of samples on average);
+    - `gain`: times 2 to 4, or divided by it;
+    - `clip`: saturated at a rail between 0 and 0.2.
 
     Args:
         key: typed PRNG key; only the values depend on it, not the mask.
@@ -310,7 +310,7 @@ def apply_failure(
     Raises:
         ValueError: unknown kind; the message lists the known ones.
 
-    Source: dissertation, section 3.3.3.1, for uniform and gaussian. Gaussian noise is not clipped,
+    Source: Shim (2020), section 3.3.3.1, for uniform and gaussian. Gaussian noise is not clipped,
     so a third of its samples lie outside [-1, 1], as the source's definition has it. The other
     kinds are ours, for robustness scores.
     """

@@ -1,7 +1,7 @@
 """Fusion weights: how they are computed from the features, normalized, and applied.
 
-Arrays with a sensor axis have it first for features (``[branch, batch, feature]``) and last for
-weights (``[batch, branch]``), as a user reads them: one row of weights per example.
+Arrays with a sensor axis have it first for features (`[branch, batch, feature]`) and last for
+weights (`[batch, branch]`), as a user reads them: one row of weights per example.
 """
 
 from __future__ import annotations
@@ -36,14 +36,14 @@ def normalize(scores: Float[Array, "*b k"], normalizer: Normalizer | str) -> Flo
 
     Args:
         scores: one score per sensor, any leading axes.
-        normalizer: ``"softmax_sigmoid"`` is the source as printed (section 3.2.1). Its weights are
+        normalizer: `"softmax_sigmoid"` is the source as printed (section 3.2.1). Its weights are
             confined: for K = 9 to [0.044, 0.254], so it cannot express the weights of 0.33 to 0.45
-            that the source's Figure 3.7 shows. ``"softmax"`` can.
+            that the source's Figure 3.7 shows. `"softmax"` can.
 
     Returns:
         Weights with the shape of `scores`.
 
-    Source: M. S. Shim (2020), section 3.2.1 and Equation 3.1.
+    Source: Shim (2020), section 3.2.1 and Eq. 3.1.
     """
     if normalizer == "softmax_sigmoid":
         scores = jax.nn.sigmoid(scores)
@@ -55,10 +55,10 @@ def normalize(scores: Float[Array, "*b k"], normalizer: Normalizer | str) -> Flo
 class Gate(nn.Module):
     """The "FC-con" block: concatenated features, one hidden layer, one score per sensor.
 
-    ``[branch, batch, feature] -> [batch, branch]``; the last layer starts at zero, so that training
+    `[branch, batch, feature] -> [batch, branch]`; the last layer starts at zero, so that training
     starts from equal weights.
 
-    Source: Patel et al. (IROS 2017), NetGated; M. S. Shim (2020), Figures 3.1 and 3.3.
+    Source: Patel et al. (IROS 2017), NetGated; Shim (2020), Figures 3.1 and 3.3.
     """
 
     width: int
@@ -94,8 +94,8 @@ def apply_weights(
         h = \big\Vert_k K w_k z_k \quad (\text{concat}) \qquad
         h = \textstyle\sum_k w_k z_k \quad (\text{sum})
 
-    The factor K (``scale="mean"``) makes equal weights the identity, so that a gated network and
-    the baseline start from the same function. ``scale="max"`` divides by the largest weight
+    The factor K (`scale="mean"`) makes equal weights the identity, so that a gated network and
+    the baseline start from the same function. `scale="max"` divides by the largest weight
     instead: healthy sensors then pass unchanged however many have failed, but a gate without
     auxiliary paths trains badly (it can shut informative sensors off early).
     """
@@ -146,7 +146,7 @@ def embrace(
     Args:
         features: docked features of the K sensors.
         key: PRNG key of the draws, or None for the expectation.
-        keep: availability of each sensor, ``[batch, branch]``; all available when None.
+        keep: availability of each sensor, `[batch, branch]`; all available when None.
 
     Source: Choi and Lee (2019), EmbraceNet. Deviation: the expectation at inference.
     """

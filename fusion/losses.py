@@ -20,8 +20,8 @@ class LossParams(NamedTuple):
     Attributes:
         alpha: weight of the auxiliary losses (Equation 3.1).
         beta: weight of the fusion-weight regularization (Equation 3.1).
-        tau: temperature of the target ``softmax(-loss / tau)``; unused by the printed target.
-        anchor: weight that pulls learned targets to ``softmax(-loss / tau)``; 0 as printed.
+        tau: temperature of the target `softmax(-loss / tau)`; unused by the printed target.
+        anchor: weight that pulls learned targets to `softmax(-loss / tau)`; 0 as printed.
     """
 
     alpha: float | Array = 1.0
@@ -104,7 +104,7 @@ def loss_targets(
     The first is Equation 3.1 as printed; for K = 9 its values lie in [0.090, 0.136]. The second is
     :math:`e^{-L/\tau}` normalized by its sum.
 
-    Source: M. S. Shim (2020), Equation 3.1. Deviation: the second form.
+    Source: Shim (2020), Eq. 3.1. Deviation: the second form.
     """
     if normalizer == "softmax_sigmoid":
         return normalize(jnp.exp(-losses), normalizer)
@@ -128,7 +128,7 @@ def argate_loss(
         L = L_{main} + \alpha \sum_k w_k L^{aux}_k + \beta \sum_k (w_k - t_k)^2
             + \lambda \sum_k \left(t_k - \text{softmax}(-L^{aux}/\tau)_k\right)^2
 
-    averaged over the examples of the batch. With ``loss_weighting=False`` the alpha term is the
+    averaged over the examples of the batch. With `loss_weighting=False` the alpha term is the
     mean of the auxiliary losses (ARGate-WS).
 
     Args:
@@ -145,7 +145,7 @@ def argate_loss(
     Returns:
         The terms, scalars.
 
-    Source: M. S. Shim (2020), Equations 3.1 and 3.2. Deviation: the anchor term, off by default.
+    Source: Shim (2020), Eq. 3.1 and 3.2. Deviation: the anchor term, off by default.
     """
     main = jnp.mean(cross_entropy(logits, labels, config.label_smoothing))
     zero = jnp.zeros_like(main)

@@ -1,7 +1,7 @@
 """The compared networks: baseline, NetGated, ARGate-WS, ARGate+, ARGate-L, and three references.
 
 All of them share encoders and head; a `Recipe` says what differs. Parameters are one dict:
-``main`` is what inference needs, ``aux`` (unisensory heads) and ``targets`` (the lattice of
+`main` is what inference needs, `aux` (unisensory heads) and `targets` (the lattice of
 Equation 3.2) exist in training only.
 """
 
@@ -51,7 +51,7 @@ class Recipe:
     """What sets one model apart from the others.
 
     Attributes:
-        gate: where the fusion weights come from; ``"none"`` is plain late fusion.
+        gate: where the fusion weights come from; `"none"` is plain late fusion.
         auxiliary: unisensory paths that share the encoders (WS).
         loss_weighting: auxiliary losses weighted by the fusion weights (ALW).
         regularization: fusion weights pulled to targets (FWR).
@@ -99,7 +99,7 @@ class ModelConfig:
         aux_width: hidden units of each auxiliary head; 0 for a linear head.
         embrace_width: width that EmbraceNet docks each sensor's features to before it draws.
         dropout: rate after fusion and in the head, in training.
-        fusion: ``"concat"`` keeps each sensor's features apart, ``"sum"`` adds them.
+        fusion: `"concat"` keeps each sensor's features apart, `"sum"` adds them.
         normalizer: of the fusion weights, see `fusion.gating.normalize`.
         weight_sharing: auxiliary paths share the encoders; else they have their own (ablation).
         loss_weighting, regularization, learned_targets: override the recipe (ablation).
@@ -177,7 +177,7 @@ class FusionNet(nn.Module):
         """Run the network.
 
         Args:
-            x: windows, ``[batch, sensor, time]``, scaled to [-1, 1].
+            x: windows, `[batch, sensor, time]`, scaled to [-1, 1].
             key: PRNG key in training (dropout, random fusion); None at inference.
             failed: which sensors failed; read by the oracle gate only.
         """
@@ -229,7 +229,7 @@ class AuxiliaryPaths(nn.Module):
 
 
 def init(key: Array, config: ModelConfig) -> Params:
-    """Draw the parameters: ``main``, and ``aux`` and ``targets`` where the recipe has them."""
+    """Draw the parameters: `main`, and `aux` and `targets` where the recipe has them."""
     main_key, aux_key, target_key = jax.random.split(key, 3)
     x = jnp.zeros((1, config.n_sensors, config.n_times))
     failed = jnp.zeros((1, config.n_sensors), bool)
@@ -255,7 +255,7 @@ def predict(
     Args:
         main: `export(params)`.
         config: static.
-        x: windows, ``[batch, sensor, time]``, scaled to [-1, 1].
+        x: windows, `[batch, sensor, time]`, scaled to [-1, 1].
         failed: which sensors failed; read by the oracle gate only.
         key: PRNG key of dropout and random fusion, in training only.
 
@@ -291,7 +291,7 @@ def loss_config(config: ModelConfig, **options: Any) -> LossConfig:
 
 
 def count_parameters(config: ModelConfig) -> dict[str, int]:
-    """Number of trainable values by part (``main``, ``aux``, ``targets``) and in ``total``."""
+    """Number of trainable values by part (`main`, `aux`, `targets`) and in `total`."""
     shapes = jax.eval_shape(lambda key: init(key, config), jax.random.key(0))
     counts = {
         part: sum(leaf.size for leaf in jax.tree.leaves(tree)) for part, tree in shapes.items()

@@ -139,7 +139,7 @@ def plot_channel_weights(
     Raises:
         ValueError: no models, an unknown channel (the message lists the known ones), wrong shapes.
 
-    Source: dissertation, Figure 3.7.
+    Source: Shim (2020), Figure 3.7.
     """
     if channel not in channels:
         raise ValueError(f"channel {channel!r} is unknown, expected one of {list(channels)}")

@@ -58,7 +58,7 @@ def preset(dataset: Dataset, model: str = "argate_l", name: str = "paper") -> Pr
     Args:
         dataset: gives the sizes.
         model: a name in `fusion.models.MODELS`.
-        name: ``"paper"`` for the record, ``"quick"`` for the same with few epochs.
+        name: `"paper"` for the record, `"quick"` for the same with few epochs.
 
     Returns:
         Model, training and hyper-parameters; change fields with `dataclasses.replace` and

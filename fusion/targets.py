@@ -83,7 +83,7 @@ def apply_targets(
     Returns:
         Targets in [0, 1]; they need not sum to one, as in Equation 3.2.
 
-    Source: M. S. Shim (2020), Equation 3.2 and Figure 3.4; two embedding outputs and one lattice
+    Source: Shim (2020), Eq. 3.2 and Figure 3.4; two embedding outputs and one lattice
     as the source uses for KITTI.
     """
     k = losses.shape[-1]

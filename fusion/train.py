@@ -57,7 +57,7 @@ class TrainConfig:
     Attributes:
         epochs: passes over the training set; also the length of the cosine schedule.
         batch_size: examples per step; the rest of an epoch that fills no batch is left out.
-        schedule: of the learning rate, ``"cosine"`` to zero or ``"constant"``.
+        schedule: of the learning rate, `"cosine"` to zero or `"constant"`.
         clip_norm: bound of the gradient's global norm.
         jitter: standard deviation of a random gain per channel and example, in training.
         stop_targets, stop_weights, uniform_floor, label_smoothing: see `fusion.losses.LossConfig`.
@@ -197,7 +197,7 @@ def train_step(
 def make_epoch(
     model: ModelConfig, config: TrainConfig, n_examples: int
 ) -> Callable[..., tuple[TrainState, EpochMetrics]]:
-    """Build ``epoch(state, hyper, key, x, y, failed) -> (state, metrics)``, a pure function.
+    """Build `epoch(state, hyper, key, x, y, failed) -> (state, metrics)`, a pure function.
 
     One epoch is one scan over shuffled batches. Jit it once; it then serves every seed, every
     corruption and every value of `hyper`. To train S seeds together, vmap it over `state`, `key`
@@ -260,7 +260,7 @@ def evaluate(
         batch_size: examples per chunk; bounds the memory.
 
     Returns:
-        (logits ``[n, class]``, fusion weights ``[n, sensor]``).
+        (logits `[n, class]`, fusion weights `[n, sensor]`).
     """
     n = x.shape[0]
     mask = jnp.zeros(x.shape[:2], bool) if failed is None else failed
@@ -289,10 +289,10 @@ def make_train(
     *,
     redraw: bool = True,
 ) -> Callable[..., tuple[TrainState, EpochMetrics]]:
-    """Build ``train(key, hyper, x, y) -> (state, metrics)``, the whole run as one pure function.
+    """Build `train(key, hyper, x, y) -> (state, metrics)`, the whole run as one pure function.
 
-    For sweeps: ``jax.vmap(train, (0, None, None, None))`` trains a batch of seeds and
-    ``jax.vmap(train, (None, 0, None, None))`` a batch of hyper-parameters in one program. It draws
+    For sweeps: `jax.vmap(train, (0, None, None, None))` trains a batch of seeds and
+    `jax.vmap(train, (None, 0, None, None))` a batch of hyper-parameters in one program. It draws
     the same keys as `fusion.fit.fit`, so that one run of either gives the same network.
 
     Returns:

@@ -80,8 +80,7 @@ def steering_angle(params: NetworkParams, rates: Float[Array, "2"]) -> Float[Arr
         params: NetworkParams; `steering_gain` is `g` [deg/Hz], 1 in the source.
         rates: of the left and the right motor neuron [Hz].
 
-    Source:
-        Shim (2020), section 2.4.3. The sign is that of our world: the source writes
+    Source: Shim (2020), section 2.4.3. The sign is that of our world: the source writes
         `freq_l - freq_r` and steers left when that is negative.
     """
     return params.steering_gain * (rates[1] - rates[0])

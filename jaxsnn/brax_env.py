@@ -1,8 +1,8 @@
-"""The robot world as a brax ``Env``: brax's wrappers and learners run on it; the one file with
+"""The robot world as a brax `Env`: brax's wrappers and learners run on it; the one file with
 brax.
 
 One robot is one environment; brax's wrappers vmap it. The observation, the reward and the meaning
-of an action are those of :func:`jaxsnn.navigation.navigation_env`. Importing brax takes seconds and
+of an action are those of `jaxsnn.navigation.navigation_env`. Importing brax takes seconds and
 prints two lines to stdout, so nothing else in the package imports this module.
 
 >>> from jaxsnn import scenarios
@@ -30,7 +30,7 @@ __all__ = ["FreshResetWrapper", "NavigationEnv", "brax_compatibility", "wrap_for
 class PipelineState(NamedTuple):
     """What a robot carries: its pose, and a key for its sensors' noise as raw words.
 
-    brax's wrappers select between states with ``where`` after a reshape, which typed keys do not
+    brax's wrappers select between states with `where` after a reshape, which typed keys do not
     take.
     """
 
@@ -56,20 +56,20 @@ def _unpack(robot: world.State) -> world.State:
 class NavigationEnv(Env):
     """One robot on one map.
 
-    Observation ``[8]``: :func:`jaxsnn.navigation.observation`. Action ``[1]`` in [-1, 1]: 1 steers
-    45 degrees to the left. Reward: :func:`jaxsnn.navigation.navigation_reward`. ``done`` is 1.0
-    after arrival, collision or a state that is not finite; ``metrics`` say which. The limit on
-    steps is brax's ``episode_length``.
+    Observation `[8]`: `jaxsnn.navigation.observation`. Action `[1]` in [-1, 1]: 1 steers
+    45 degrees to the left. Reward: `jaxsnn.navigation.navigation_reward`. `done` is 1.0
+    after arrival, collision or a state that is not finite; `metrics` say which. The limit on
+    steps is brax's `episode_length`.
 
     Args:
-        params: the map; it travels in ``pipeline_state`` and may be changed there.
+        params: the map; it travels in `pipeline_state` and may be changed there.
     """
 
     def __init__(self, params: world.Params) -> None:
         self.params = params
 
     def reset(self, rng: jax.Array) -> State:
-        """A robot in a start circle; ``rng`` may be a raw or a typed key."""
+        """A robot in a start circle; `rng` may be a raw or a typed key."""
         robot = world.reset(_typed(rng), self.params)
         zero = jnp.zeros((), jnp.float32)
         return State(
@@ -118,7 +118,7 @@ class NavigationEnv(Env):
 class FreshResetWrapper(Wrapper):
     """Start the next episode anywhere in the start circles.
 
-    brax's own ``AutoResetWrapper`` goes back to the first state of each environment for the whole
+    brax's own `AutoResetWrapper` goes back to the first state of each environment for the whole
     run. Wraps a batched environment.
     """
 
@@ -160,11 +160,11 @@ def wrap_for_training(
     action_repeat: int = 1,
     randomization_fn: Callable[..., Any] | None = None,
 ) -> Wrapper:
-    """Vmap, episode limit and fresh resets; pass it as ``wrap_env_fn`` to brax's learners.
+    """Vmap, episode limit and fresh resets; pass it as `wrap_env_fn` to brax's learners.
 
     Raises:
-        ValueError: ``randomization_fn`` is given: there is no brax system to randomize. Make
-            one :class:`NavigationEnv` for each map instead.
+        ValueError: `randomization_fn` is given: there is no brax system to randomize. Make
+            one `NavigationEnv` for each map instead.
     """
     if randomization_fn is not None:
         raise ValueError(
@@ -175,7 +175,7 @@ def wrap_for_training(
 
 
 def _device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:
-    """A copy for each device along a new leading axis, as ``pmap`` takes it."""
+    """A copy for each device along a new leading axis, as `pmap` takes it."""
     n = len(devices)
     return jax.tree.map(lambda a: jnp.broadcast_to(a, (n, *jnp.shape(a))), x)
 

@@ -64,8 +64,7 @@ def rate_table(
         scheme: "reference" (S1, S2) or "proposed" (S3, S4).
         angle_code: which interval of the angle gets which of the four rates, see `ANGLE_CODES`.
 
-    Source:
-        Shim (2020), section 2.4.2.
+    Source: Shim (2020), section 2.4.2.
 
     Example:
         >>> rate_table("proposed").sonar.tolist()

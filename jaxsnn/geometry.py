@@ -41,11 +41,11 @@ def ray_segments(
 
     .. math:: o + t\,u = a + s\,(b - a), \quad t \ge 0,\; 0 \le s \le 1
 
-    Symbols: :math:`o` is ``origin`` and :math:`u` the unit vector ``direction``; :math:`a, b` are
-    the ends of a row ``(ax, ay, bx, by)`` of ``segments``. All lengths share one unit.
+    Symbols: :math:`o` is `origin` and :math:`u` the unit vector `direction`; :math:`a, b` are
+    the ends of a row `(ax, ay, bx, by)` of `segments`. All lengths share one unit.
 
     Returns:
-        :math:`t` for each segment, ``inf`` for a miss. A ray along the segment's own line misses
+        :math:`t` for each segment, `inf` for a miss. A ray along the segment's own line misses
         it: the neighbouring sides of a closed polygon report that contact.
     """
     start = segments[:, :2] - origin[None, :]
@@ -74,7 +74,7 @@ def ray_circles(
 
     .. math:: t = -b - \sqrt{b^2 - c}, \quad b = (o - m) \cdot u,\; c = |o - m|^2 - \rho^2
 
-    Symbols: :math:`o` is ``origin``, :math:`u` the unit vector ``direction``, a row of ``circles``
+    Symbols: :math:`o` is `origin`, :math:`u` the unit vector `direction`, a row of `circles`
     is centre and radius :math:`(m_x, m_y, \rho)`.
     """
     offset = origin[None, :] - circles[:, :2]
@@ -91,7 +91,7 @@ def ray_circles(
 def ray_box(
     origin: Float[Array, "2"], direction: Float[Array, "2"], bounds: Float[Array, "4"]
 ) -> Float[Array, ""]:
-    """Distance along a ray that starts inside the rectangle ``(x0, y0, x1, y1)`` to its wall."""
+    """Distance along a ray that starts inside the rectangle `(x0, y0, x1, y1)` to its wall."""
     wall = jnp.where(direction > 0, bounds[2:], bounds[:2])
     safe = jnp.where(direction == 0, jnp.ones_like(direction), direction)
     t = jnp.where(direction == 0, jnp.inf, (wall - origin) / safe)
@@ -104,16 +104,16 @@ def disc_circle_contact(
     circles: Float[Array, "c 2"],
     reach: Float[Array, "c"],
 ) -> Float[Array, "c"]:
-    r"""Fraction of a straight move at which a point comes within ``reach`` of each centre.
+    r"""Fraction of a straight move at which a point comes within `reach` of each centre.
 
     .. math:: |p + t\,d - m|^2 = \rho^2, \quad 0 \le t
 
-    Symbols: :math:`p` is ``centre``, :math:`d` the row of ``move`` (relative to that circle, so
-    obstacles may move too), :math:`m` the row of ``circles``, :math:`\rho` is ``reach``: the radius
+    Symbols: :math:`p` is `centre`, :math:`d` the row of `move` (relative to that circle, so
+    obstacles may move too), :math:`m` the row of `circles`, :math:`\rho` is `reach`: the radius
     of the disc plus that of the circle.
 
     Returns:
-        :math:`t`, ``inf`` if there is no contact within the move (:math:`t > 1`). A disc that
+        :math:`t`, `inf` if there is no contact within the move (:math:`t > 1`). A disc that
         already touches is stopped at 0 when it moves inwards, and free when it moves away.
     """
     offset = centre[None, :] - circles
@@ -139,15 +139,15 @@ def disc_segment_contact(
 
     .. math:: |\sigma| - t\,\nu = r \quad \text{or} \quad |p + t\,d - a| = r
 
-    Symbols: :math:`\sigma` is the signed distance of ``centre`` :math:`p` from the side's line and
+    Symbols: :math:`\sigma` is the signed distance of `centre` :math:`p` from the side's line and
     :math:`\nu` the speed towards it; :math:`a` is the first end of the side; :math:`r` is
-    ``radius``;
-    :math:`d` the row of ``move``, relative to that side.
+    `radius`;
+    :math:`d` the row of `move`, relative to that side.
 
     Only the first corner of each side is tested: in a closed polygon it is the last one's second.
 
     Returns:
-        :math:`t` in [0, 1], ``inf`` for no contact.
+        :math:`t` in [0, 1], `inf` for no contact.
     """
     start = segments[:, :2]
     edge = segments[:, 2:] - start
@@ -172,7 +172,7 @@ def disc_box_contact(
     radius: Float[Array, ""],
     bounds: Float[Array, "4"],
 ) -> Float[Array, ""]:
-    """Fraction of a straight move at which a disc inside a rectangle touches a wall, or ``inf``."""
+    """Fraction of a straight move at which a disc inside a rectangle touches a wall, or `inf`."""
     room = jnp.where(move > 0, bounds[2:] - radius - centre, bounds[:2] + radius - centre)
     safe = jnp.where(move == 0, jnp.ones_like(move), move)
     t = jnp.where(move == 0, jnp.inf, jnp.maximum(room / safe, 0.0))
@@ -184,13 +184,13 @@ def disc_box_contact(
 
 
 def polygon_segments(polygon: Polygon) -> np.ndarray:
-    """The sides ``(ax, ay, bx, by)`` of a closed polygon ``[k, 2]``, as ``[k, 4]``."""
+    """The sides `(ax, ay, bx, by)` of a closed polygon `[k, 2]`, as `[k, 4]`."""
     points = np.asarray(polygon, dtype=np.float64)
     return np.concatenate([points, np.roll(points, -1, axis=0)], axis=1)
 
 
 def inside_polygon(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
-    """For each point ``[n, 2]``: is it inside the polygon ``[k, 2]`` (even-odd rule)?"""
+    """For each point `[n, 2]`: is it inside the polygon `[k, 2]` (even-odd rule)?"""
     sides = polygon_segments(polygon)
     px, py = points[:, :1], points[:, 1:]
     ax, ay, bx, by = (sides[None, :, i] for i in range(4))
@@ -201,7 +201,7 @@ def inside_polygon(points: np.ndarray, polygon: np.ndarray) -> np.ndarray:
 
 
 def segment_distance(a: np.ndarray, b: np.ndarray, segments: np.ndarray) -> np.ndarray:
-    """Distance between the segments a-b ``[n, 2]`` and each row of ``segments``: ``[n, s]``."""
+    """Distance between the segments a-b `[n, 2]` and each row of `segments`: `[n, s]`."""
 
     def point_to(p: np.ndarray, q0: np.ndarray, q1: np.ndarray) -> np.ndarray:
         edge = q1 - q0
@@ -227,7 +227,7 @@ def segment_distance(a: np.ndarray, b: np.ndarray, segments: np.ndarray) -> np.n
 
 
 def check_polygon(polygon: Polygon, name: str) -> np.ndarray:
-    """The polygon as ``[k, 2]`` float64, or a ValueError that says why it is none.
+    """The polygon as `[k, 2]` float64, or a ValueError that says why it is none.
 
     Raises:
         ValueError: fewer than three corners, a value that is not finite, two equal corners in a

@@ -1,7 +1,7 @@
 """Make maps on the host: checked obstacles, and random maps that a robot can solve.
 
-:func:`make_map` turns polygons and circles into :class:`jaxsnn.world.Params` and refuses a map that
-no robot could run on, before anything is compiled. :func:`random_map` draws maps until the planner
+`make_map` turns polygons and circles into `jaxsnn.world.Params` and refuses a map that
+no robot could run on, before anything is compiled. `random_map` draws maps until the planner
 can solve one.
 """
 
@@ -35,7 +35,7 @@ def _positive(name: str, value: Number, *, zero: bool = False) -> float:
 
 
 def _rows(name: str, values: Any, width: int) -> np.ndarray:
-    """Values as float64 ``[n, width]``, n = 0 allowed."""
+    """Values as float64 `[n, width]`, n = 0 allowed."""
     rows = (
         np.asarray(values, np.float64).reshape(-1, width) if len(values) else np.zeros((0, width))
     )
@@ -99,7 +99,7 @@ def make_map(
         sonar_noise: standard deviation of each sonar [px].
         distance_noise: standard deviation of the distance sensor [px].
         angle_noise: standard deviation of the angle sensor [deg].
-        sonar_stuck: failed sonars, ``{index: what it reports [px]}``.
+        sonar_stuck: failed sonars, `{index: what it reports [px]}`.
         max_segments: room for sides of polygons.
         max_circles: room for circles.
         max_starts: room for start circles.
@@ -248,7 +248,7 @@ def _check_starts(
 
 
 def stack_maps(maps: Sequence[Params]) -> Params:
-    """Maps of equal padding as one Params with a leading axis, ready for ``jax.vmap``."""
+    """Maps of equal padding as one Params with a leading axis, ready for `jax.vmap`."""
     if not maps:
         raise ValueError("stack_maps needs at least one map, got none")
     # On the host: stacking on the device would compile once for each shape.
@@ -279,13 +279,13 @@ def random_map(
         start_radius: radius of the start circle [px].
         clearance: a path that keeps this distance from everything must exist [px].
         attempts: draws before giving up.
-        **constants: passed on to :func:`make_map`.
+        **constants: passed on to `make_map`.
 
     Returns:
-        Params with the padding of :func:`make_map`.
+        Params with the padding of `make_map`.
 
     Raises:
-        ValueError: no solvable map within ``attempts``, or the ranges are impossible.
+        ValueError: no solvable map within `attempts`, or the ranges are impossible.
     """
     if not 0 <= n_obstacles[0] <= n_obstacles[1]:
         raise ValueError(

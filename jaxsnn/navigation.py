@@ -55,14 +55,14 @@ def navigation_reward(
 
 
 def navigation_env(params: world.Params, *, max_steps: int = 200) -> Env:
-    """The robot world as an :class:`Env`; an action of 1 steers 45 degrees to the left.
+    """The robot world as an `Env`; an action of 1 steers 45 degrees to the left.
 
     Args:
         params: the map.
         max_steps: a trial that has not ended after so many control steps is truncated.
 
     Raises:
-        ValueError: ``max_steps`` is below 1.
+        ValueError: `max_steps` is below 1.
     """
     if max_steps < 1:
         raise ValueError(f"max_steps = {max_steps} must be at least 1")

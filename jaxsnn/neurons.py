@@ -106,8 +106,7 @@ def lif_step(
     Returns:
         The new state and the spikes of this step, `[n]` bool.
 
-    Source:
-        Shim (2020), Eq. 2.1; order of operations as in Brian 2 with `(unless refractory)`.
+    Source: Shim (2020), Eq. 2.1; order of operations as in Brian 2 with `(unless refractory)`.
 
     Example:
         >>> params = LIFParams(v_th=1.0)

@@ -1,7 +1,7 @@
 """Shortest collision-free paths on a map, on the host: the unit of the path ratio.
 
-:func:`path_field` builds a visibility graph over the obstacles, grown by the robot's radius, and
-plans from everywhere to the target; a :class:`PathField` then answers for any start at once.
+`path_field` builds a visibility graph over the obstacles, grown by the robot's radius, and
+plans from everywhere to the target; a `PathField` then answers for any start at once.
 """
 
 from __future__ import annotations
@@ -59,7 +59,7 @@ class Obstacles:
         return loops
 
     def clearance(self, a: np.ndarray, b: np.ndarray) -> np.ndarray:
-        """Distance of each straight line a-b ``[n, 2]`` to what is nearest, negative inside."""
+        """Distance of each straight line a-b `[n, 2]` to what is nearest, negative inside."""
         room = np.min(
             [
                 np.minimum(a, b)[:, 0] - self.bounds[0],
@@ -81,7 +81,7 @@ class Obstacles:
 
 
 def _nodes(obstacles: Obstacles, radius: float) -> np.ndarray:
-    """Corners of polygons around the obstacles grown by ``radius``: where shortest paths bend."""
+    """Corners of polygons around the obstacles grown by `radius`: where shortest paths bend."""
     reach = radius + _SLACK
     nodes: list[np.ndarray] = []
     for loop in obstacles.loops():
@@ -124,7 +124,7 @@ class PathField:
     obstacles: Obstacles
 
     def _last_leg(self, points: np.ndarray) -> np.ndarray:
-        """Length of the straight line to the arrival circle, ``inf`` where it is blocked."""
+        """Length of the straight line to the arrival circle, `inf` where it is blocked."""
         offset = points - self.target
         gap = np.hypot(offset[:, 0], offset[:, 1])
         end = (
@@ -135,12 +135,12 @@ class PathField:
         return np.where(free, np.maximum(gap - self.arrival_radius, 0.0), np.inf)
 
     def lengths(self, starts: np.ndarray) -> np.ndarray:
-        """Length [px] of the shortest path from each start ``[n, 2]``, ``inf`` if there is none."""
+        """Length [px] of the shortest path from each start `[n, 2]`, `inf` if there is none."""
         starts = np.asarray(starts, np.float64)
         return np.array([self._from(start)[0] for start in starts])
 
     def path(self, start: Point) -> np.ndarray:
-        """Way points ``[k, 2]`` from a start to the centre of the target.
+        """Way points `[k, 2]` from a start to the centre of the target.
 
         Raises:
             ValueError: there is no path.
@@ -227,7 +227,7 @@ def path_field(params: Params, *, clearance: int | float | None = None) -> PathF
 def shortest_path(
     params: Params, start: Point, *, clearance: int | float | None = None
 ) -> tuple[float, np.ndarray]:
-    """Length [px] and way points ``[k, 2]`` of the shortest collision-free path from one start.
+    """Length [px] and way points `[k, 2]` of the shortest collision-free path from one start.
 
     Raises:
         ValueError: the start is not free, or there is no path.

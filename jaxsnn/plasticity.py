@@ -141,8 +141,7 @@ def stdp_step(
     Returns:
         The new STDPState.
 
-    Source:
-        Shim (2020), Eq. 2.4-2.7, after Florian (2007).
+    Source: Shim (2020), Eq. 2.4-2.7, after Florian (2007).
 
     Example:
         >>> one, none = jnp.ones(1), jnp.zeros(1)
@@ -196,8 +195,7 @@ def apply_reward(
     Returns:
         The new weights.
 
-    Source:
-        Shim (2020), Eq. 2.3 and 2.8. Soft bounds are ours.
+    Source: Shim (2020), Eq. 2.3 and 2.8. Soft bounds are ours.
 
     Example:
         >>> apply_reward(jnp.array([1.0, 4.0]), jnp.log(jnp.array([2.0, 2.0])), 0.0, 5.0,
@@ -227,8 +225,7 @@ def stdp_curve(params: STDPParams, delta_t: Float[Array, " n"]) -> Float[Array, 
 
     with :math:`\Delta t = t_{post} - t_{pre}` [s]; zero at :math:`\Delta t = 0`.
 
-    Source:
-        Shim (2020), Eq. 2.2. Deviation: Eq. 2.2 prints :math:`e^{-\Delta t/\tau_-}` for
+    Source: Shim (2020), Eq. 2.2. Deviation: Eq. 2.2 prints :math:`e^{-\Delta t/\tau_-}` for
         :math:`\Delta t < 0`, which grows without bound; the sign here is that of Figure 2.2.
 
     Example:

@@ -1,8 +1,8 @@
 """Pictures of maps, trials, learning curves, plasticity curves and spikes; the one file with
 matplotlib.
 
-Every function returns a :class:`matplotlib.figure.Figure` that belongs to nobody's window; call its
-``savefig``. Only :func:`trial_gif` writes a file itself.
+Every function returns a `matplotlib.figure.Figure` that belongs to nobody's window; call its
+`savefig`. Only `trial_gif` writes a file itself.
 """
 
 from __future__ import annotations
@@ -55,7 +55,7 @@ def _open_spines(ax: Axes) -> None:
 
 
 def draw_map(ax: Axes, params: world.Params, *, t: int = 0) -> list[Any]:
-    """Draw walls, obstacles (where they are at step ``t``), start circles and the target.
+    """Draw walls, obstacles (where they are at step `t`), start circles and the target.
 
     Returns:
         The patches of the obstacles, so that an animation can move them.
@@ -125,7 +125,7 @@ def trajectories(
 
     Args:
         params: the map.
-        paths: one ``[steps, 2]`` array of positions for each trial [px].
+        paths: one `[steps, 2]` array of positions for each trial [px].
         arrived: did the trial reach the target?
         collided: did it end in a collision? Neither: it ran out of steps.
         title: text above the picture.
@@ -180,7 +180,7 @@ def learning_curves(
     """Mean over seeds with its 95 % interval, one curve for each name.
 
     Args:
-        curves: name -> ``[seeds, trials]``, for example success of each training trial as 0 or 1.
+        curves: name -> `[seeds, trials]`, for example success of each training trial as 0 or 1.
         window: width of the running mean over trials.
         xlabel: text of the x axis.
         ylabel: text of the y axis.
@@ -211,11 +211,11 @@ def learning_curves(
 
 
 def stdp_curve(lag: np.ndarray, change: np.ndarray, *, ax: Axes | None = None) -> Figure:
-    """Weight change against ``t_post - t_pre`` (Figure 2.2).
+    """Weight change against `t_post - t_pre` (Figure 2.2).
 
     Args:
-        lag: time of the postsynaptic spike minus that of the presynaptic one ``[n]`` [ms].
-        change: change of the weight for one such pair ``[n]`` [mV].
+        lag: time of the postsynaptic spike minus that of the presynaptic one `[n]` [ms].
+        change: change of the weight for one such pair `[n]` [mV].
         ax: axes to draw in.
     """
     return rm_stdp_curves(lag, {"": change}, ax=ax)
@@ -224,11 +224,11 @@ def stdp_curve(lag: np.ndarray, change: np.ndarray, *, ax: Axes | None = None) -
 def rm_stdp_curves(
     lag: np.ndarray, changes: Mapping[str, np.ndarray], *, ax: Axes | None = None
 ) -> Figure:
-    """Weight change against ``t_post - t_pre``, one curve for each reward (Figure 2.3).
+    """Weight change against `t_post - t_pre`, one curve for each reward (Figure 2.3).
 
     Args:
-        lag: time of the postsynaptic spike minus that of the presynaptic one ``[n]`` [ms].
-        changes: label of the reward -> change of the weight ``[n]`` [mV].
+        lag: time of the postsynaptic spike minus that of the presynaptic one `[n]` [ms].
+        changes: label of the reward -> change of the weight `[n]` [mV].
         ax: axes to draw in.
     """
     figure, ax = _axes(ax, (5.0, 3.6))
@@ -255,8 +255,8 @@ def spike_raster(
     """Spikes of each layer over time, and beside them its weights.
 
     Args:
-        spikes: name of the layer -> ``[steps, neurons]`` bool.
-        weights: name -> ``[pre, post]`` signed weights [mV]; red excites, blue inhibits.
+        spikes: name of the layer -> `[steps, neurons]` bool.
+        weights: name -> `[pre, post]` signed weights [mV]; red excites, blue inhibits.
         dt: length of a step [ms].
     """
     weights = weights or {}
@@ -310,9 +310,9 @@ def trial_gif(
     Args:
         file: where to write.
         params: the map; moving obstacles move.
-        path: positions ``[steps, 2]`` [px].
-        headings: ``[steps]`` [rad].
-        sonar: readings ``[steps, 5]`` [px]; no rays are drawn without them.
+        path: positions `[steps, 2]` [px].
+        headings: `[steps]` [rad].
+        sonar: readings `[steps, 5]` [px]; no rays are drawn without them.
         arrived: the trial ended at the target.
         collided: the trial ended in a collision.
         title: text above the picture.

@@ -1,7 +1,7 @@
 """Proximal policy optimization in one compiled program: the modern reference on the same world.
 
-``make_train(config, env)`` gives ``train(key)``, a pure function of a key: vmap it over seeds, jit
-it as a whole. Environments are pairs of pure functions (:class:`Env`); :mod:`jaxsnn.navigation`
+`make_train(config, env)` gives `train(key)`, a pure function of a key: vmap it over seeds, jit
+it as a whole. Environments are pairs of pure functions (`Env`); `jaxsnn.navigation`
 is the robot world as one. Robots that end a trial start the next one at once, from a fresh start.
 
 >>> import jax
@@ -95,7 +95,7 @@ class Config:
 
 
 class Rollout(NamedTuple):
-    """Means over one update, leaves ``[n_updates]`` in the result of a training."""
+    """Means over one update, leaves `[n_updates]` in the result of a training."""
 
     episodes: Array  # trials that ended
     successes: Array  # trials that ended well
@@ -108,7 +108,7 @@ class Rollout(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What ``train`` returns."""
+    """What `train` returns."""
 
     params: Any
     metrics: Rollout
@@ -123,7 +123,7 @@ class ActorCritic(nn.Module):
 
     @nn.compact
     def __call__(self, obs: Array) -> tuple[Array, Array, Array]:
-        """Mean ``[a]``, log deviation ``[a]``, value ``[]``."""
+        """Mean `[a]`, log deviation `[a]`, value `[]`."""
 
         def tower(size: int, scale: float) -> Array:
             x = obs
@@ -167,9 +167,9 @@ def gae(
     .. math:: \delta_t = r_t + \gamma V(s'_t) - V(s_t), \qquad
         A_t = \delta_t + \gamma \lambda A_{t+1}
 
-    Symbols: :math:`\gamma` is ``discount``, :math:`\lambda` is ``gae_lambda``; :math:`V(s'_t)` is
-    ``next_values``, the value of the state that the action led to before any reset, and counts as 0
-    where ``terminated``; the sum stops where ``ended``.
+    Symbols: :math:`\gamma` is `discount`, :math:`\lambda` is `gae_lambda`; :math:`V(s'_t)` is
+    `next_values`, the value of the state that the action led to before any reset, and counts as 0
+    where `terminated`; the sum stops where `ended`.
 
     Source: Schulman et al. (2016), Eq. 16.
     """
@@ -192,15 +192,15 @@ def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
     .. math:: L = \mathbb{E}\,\min(\rho A,\, \operatorname{clip}(\rho, 1 - c, 1 + c) A)
         - c_v\,(V - \hat R)^2 + c_e H, \qquad \rho = \pi(a|s) / \pi_{\text{old}}(a|s)
 
-    Symbols: :math:`c` is ``config.clip``, :math:`c_v` is ``config.value_coef``, :math:`c_e` is
-    ``config.entropy_coef``; :math:`A` from :func:`gae`, normalized over each minibatch.
+    Symbols: :math:`c` is `config.clip`, :math:`c_v` is `config.value_coef`, :math:`c_e` is
+    `config.entropy_coef`; :math:`A` from `gae`, normalized over each minibatch.
 
     Args:
         config: sizes and constants.
         env: the environment, reset to a fresh start whenever an episode ends.
 
     Returns:
-        ``train(key) -> Result``: network parameters, and metrics with leaves ``[n_updates]``.
+        `train(key) -> Result`: network parameters, and metrics with leaves `[n_updates]`.
 
     Source: Schulman et al. (2017), Eq. 7 and 9; one jit for the run as in PureJaxRL (Lu et al.,
         2022).
@@ -324,13 +324,13 @@ def evaluate(
     Args:
         config: the one that the parameters were trained with.
         env: the environment; path lengths make sense with a
-            :func:`jaxsnn.navigation.navigation_env`.
-        params: ``Result.params``.
+            `jaxsnn.navigation.navigation_env`.
+        params: `Result.params`.
         keys: one for each episode.
         max_steps: steps to scan; the environment's own limit or more.
 
     Returns:
-        (final states, success ``[n]``, terminated ``[n]``).
+        (final states, success `[n]`, terminated `[n]`).
     """
 
     def one(key: Array) -> tuple[Any, Array, Array]:

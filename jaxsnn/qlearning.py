@@ -47,7 +47,7 @@ class Params(NamedTuple):
 
 
 class Trials(NamedTuple):
-    """What became of each trial, leaves ``[learners, trials]``."""
+    """What became of each trial, leaves `[learners, trials]`."""
 
     arrived: Array  # bool
     collided: Array  # bool; neither flag: out of steps
@@ -103,7 +103,7 @@ def discretize(reading: world.Reading) -> Int[Array, ""]:
 
 
 def init(n: int) -> Float[Array, "n s a"]:
-    """Tables of zeros for ``n`` learners.
+    """Tables of zeros for `n` learners.
 
     Raises:
         ValueError: there is no learner.
@@ -120,7 +120,7 @@ def td_target(
 
     .. math:: r + \gamma\,(1 - \text{over}) \max_a Q(s', a)
 
-    Symbols: :math:`\gamma` is ``params.discount``; ``over`` is true when the step ended in arrival
+    Symbols: :math:`\gamma` is `params.discount`; `over` is true when the step ended in arrival
     or collision; running out of steps does not end the task and keeps the second term.
 
     Source: Watkins & Dayan (1992).
@@ -141,7 +141,7 @@ class _Learner(NamedTuple):
 
 
 def _begin(key: Array, trial: Array, params: world.Params) -> _Learner:
-    """Trial number ``trial`` of a learner; depends on its key and that number alone."""
+    """Trial number `trial` of a learner; depends on its key and that number alone."""
     k_reset, k_act = jax.random.split(jax.random.fold_in(key, trial))
     robot = world.reset(k_reset, params)
     row = discretize(world.observe(robot, params))
@@ -160,28 +160,28 @@ def run_trials(
     learn: bool,
     first_trial: int | Int[Array, ""] = 0,
 ) -> tuple[Float[Array, "n s a"], Trials]:
-    r"""Run trials of ``n`` independent learners on one map.
+    r"""Run trials of `n` independent learners on one map.
 
     .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha\,(r + \gamma \max_{a'} Q(s', a') - Q(s, a))
 
-    Symbols: :math:`\alpha` is ``q.learning_rate``, :math:`\gamma` is ``q.discount``; the action is
-    random with chance ``q.epsilon``, otherwise the best of the row, forward in a tie.
+    Symbols: :math:`\alpha` is `q.learning_rate`, :math:`\gamma` is `q.discount`; the action is
+    random with chance `q.epsilon`, otherwise the best of the row, forward in a tie.
 
     Args:
-        keys: one typed PRNG key for each learner; trial i uses ``fold_in(key, i)``.
-        tables: from :func:`init` or an earlier call.
-        q: constants, leaves scalar or ``[n]``.
+        keys: one typed PRNG key for each learner; trial i uses `fold_in(key, i)`.
+        tables: from `init` or an earlier call.
+        q: constants, leaves scalar or `[n]`.
         params: the map.
         n_trials: trials of each learner.
         max_steps: a trial that has not ended after so many control steps has failed.
         first_trial: number of the first trial, to go on where an earlier call ended.
-        learn: update the tables; set ``q.epsilon`` to 0 for a greedy test.
+        learn: update the tables; set `q.epsilon` to 0 for a greedy test.
 
     Returns:
         (tables, Trials).
 
     Raises:
-        ValueError: ``n_trials`` or ``max_steps`` is below 1.
+        ValueError: `n_trials` or `max_steps` is below 1.
 
     Source: Shim & Li (2017), section 2.4.3 (actions, epsilon). Its rewards for Q-learning, learning
     rate and discount are not given: arrival and collision are rewarded as in section 2.2.2.1.

@@ -96,8 +96,7 @@ def avoidance_rewards(params: RewardParams, d: Float[Array, "*n"]) -> Float[Arra
     .. math:: r_1(d) = \frac{d_{safe} - d}{d_{safe}} + k, \qquad r_2(d) = -r_1(d),
               \qquad d < d_{safe}
 
-    Source:
-        Shim (2020), Eq. 2.9.
+    Source: Shim (2020), Eq. 2.9.
 
     Example:
         >>> avoidance_rewards(RewardParams(k=0.5), jnp.array([50.0, 100.0])).tolist()
@@ -112,8 +111,7 @@ def target_reward(params: RewardParams, d: Float[Array, "*n"]) -> Float[Array, "
 
     .. math:: r_3(d) = \frac{d_{tar} - d}{d_{tar}} + 1, \qquad d < d_{tar}
 
-    Source:
-        Shim (2020), Eq. 2.10.
+    Source: Shim (2020), Eq. 2.10.
 
     Example:
         >>> target_reward(RewardParams(), jnp.array([100.0, 200.0])).tolist()
@@ -188,8 +186,7 @@ def tempered(
         reward: for the synapses of the left and of the right motor.
         steering: turn that goes with it [deg], positive to the left.
 
-    Source:
-        Ours; the delta rule of Widrow and Hoff (1960) with the sign of the source's rewards.
+    Source: Ours; the delta rule of Widrow and Hoff (1960) with the sign of the source's rewards.
 
     Example:
         >>> params = RewardParams(goal_angle=60.0)
@@ -227,8 +224,7 @@ def synapse_signs(
 
     A reward acts on the magnitude of a weight: `-r` weakens an inhibitory synapse, too.
 
-    Source:
-        Shim (2020), section 2.3.2.
+    Source: Shim (2020), section 2.3.2.
 
     Example:
         >>> first, second = synapse_signs(jnp.array([1.0, -1.0]), jnp.array([1.0, -1.0]))

@@ -52,8 +52,7 @@ def baseline_update(
         tau: time constant [s].
         duration: `T` of the steps [s].
 
-    Source:
-        Ours.
+    Source: Ours.
 
     Example:
         >>> state = baseline_init(1)

@@ -114,8 +114,7 @@ def stdp_window(
         The state after the window and :math:`\int z\,dt` [mV], the sum over the `T` values of `z`
         after each step, times dt.
 
-    Source:
-        Shim (2020), Eq. 2.4-2.7, summed over a window in closed form.
+    Source: Shim (2020), Eq. 2.4-2.7, summed over a window in closed form.
     """
     p_plus, p_minus = keep * state.traces.p_plus, keep * state.traces.p_minus
     pre_rows = jnp.concatenate([pre, p_plus[None]])

@@ -1,7 +1,7 @@
 """A robot with five sonars in a closed plane: kinematics, sensors, collision, arrival.
 
-Pure functions over two pytrees: :class:`Params` is a map with all constants (vmap over it to run
-many maps at once, every map padded to the same size), :class:`State` is what a control step
+Pure functions over two pytrees: `Params` is a map with all constants (vmap over it to run
+many maps at once, every map padded to the same size), `State` is what a control step
 changes.
 
 >>> import jax
@@ -47,7 +47,7 @@ N_SONARS = 5
 
 
 class Params(NamedTuple):
-    """A map and the constants of its robot; made by :func:`jaxsnn.maps.make_map`.
+    """A map and the constants of its robot; made by `jaxsnn.maps.make_map`.
 
     Every leaf is an array, so maps of equal padding can be stacked and vmapped.
     """
@@ -121,7 +121,7 @@ def _patrol(t: Array, params: Params) -> Array:
 def obstacles_at(
     t: Int[Array, ""], params: Params
 ) -> tuple[Float[Array, "s 4"], Float[Array, "c 3"]]:
-    """Segments and circles where they are after ``t`` control steps, padding included."""
+    """Segments and circles where they are after `t` control steps, padding included."""
     steps = _patrol(t, params)
     shift = params.segment_velocity * steps
     segments = params.segments + jnp.concatenate([shift, shift], axis=1)
@@ -132,12 +132,12 @@ def obstacles_at(
 def reset(
     key: Key[Array, ""], params: Params, *, circle: int | Int[Array, ""] | None = None
 ) -> State:
-    """A robot at a uniform point of a start circle, facing the target within ``heading_spread``.
+    """A robot at a uniform point of a start circle, facing the target within `heading_spread`.
 
     Args:
         key: typed PRNG key.
         params: the map.
-        circle: index of the start circle; drawn with ``start_probs`` when it is not given.
+        circle: index of the start circle; drawn with `start_probs` when it is not given.
 
     Returns:
         State at step 0.
@@ -173,9 +173,9 @@ def observe(state: State, params: Params, *, others: Discs | None = None) -> Rea
         \beta = \operatorname{atan2}(u \times (g - p),\, u \cdot (g - p))
 
     Symbols: :math:`t_o` is the distance along the ray to obstacle, wall or other robot :math:`o`;
-    :math:`\psi` is ``state.heading``, :math:`\alpha_i` are ``params.sonar_angles``, :math:`R` is
-    ``params.sonar_range`` [px], :math:`D` is ``params.distance_range`` [px]; :math:`p` the pose,
-    :math:`g` is ``params.target``, :math:`u` the unit heading.
+    :math:`\psi` is `state.heading`, :math:`\alpha_i` are `params.sonar_angles`, :math:`R` is
+    `params.sonar_range` [px], :math:`D` is `params.distance_range` [px]; :math:`p` the pose,
+    :math:`g` is `params.target`, :math:`u` the unit heading.
 
     Args:
         state: one robot.
@@ -184,7 +184,7 @@ def observe(state: State, params: Params, *, others: Discs | None = None) -> Rea
 
     Returns:
         Reading; sonar from the robot's centre, without noise unless the noise fields are set. The
-        noise of a step depends on ``state.key`` and ``state.t`` alone, so observing twice agrees.
+        noise of a step depends on `state.key` and `state.t` alone, so observing twice agrees.
 
     Source: Shim & Li (2017), section 2.4.2. The directions of the sonars are ours: the drawing of
     the car is lost.
@@ -247,16 +247,16 @@ def step(
     *,
     others: Discs | None = None,
 ) -> tuple[State, Outcome]:
-    r"""Turn by ``steering``, then drive ``speed`` pixels ahead, up to the first contact.
+    r"""Turn by `steering`, then drive `speed` pixels ahead, up to the first contact.
 
     .. math::
         \psi \leftarrow \psi + \theta, \qquad
         p \leftarrow p + \min(1, t_c, t_a)\, v\, (\cos\psi, \sin\psi)
 
-    Symbols: :math:`\theta` is ``steering`` [deg, positive = left], :math:`v` is ``params.speed``
+    Symbols: :math:`\theta` is `steering` [deg, positive = left], :math:`v` is `params.speed`
     [px per control step]; :math:`t_c` is the fraction of the move at which the disc of
-    ``params.robot_radius`` first touches anything, :math:`t_a` the one at which its centre comes
-    within ``params.arrival_radius`` of the target. Both are exact for the straight move, so nothing
+    `params.robot_radius` first touches anything, :math:`t_a` the one at which its centre comes
+    within `params.arrival_radius` of the target. Both are exact for the straight move, so nothing
     is jumped over at any speed.
 
     Args:
@@ -267,7 +267,7 @@ def step(
 
     Returns:
         State after the step and its Outcome. When pose or steering is not finite the robot stays
-        where it is and ``failed`` is set.
+        where it is and `failed` is set.
 
     Source: Shim & Li (2017), section 2.4.3 (speed 15 px, steering angle in degrees).
     Deviation: there a negative angle is to the left.
@@ -328,7 +328,7 @@ def step(
 
 
 def _seen_by_each(states: State, moves: Array, active: Array) -> Discs:
-    """For each robot the discs of all others: leaves ``[r, r, ...]``, itself masked out."""
+    """For each robot the discs of all others: leaves `[r, r, ...]`, itself masked out."""
     n = active.shape[0]
     if n == 0:
         raise ValueError("there are 0 robots; states and active need at least one robot")
@@ -344,12 +344,12 @@ def observe_many(states: State, params: Params, *, active: Bool[Array, "r"]) -> 
     """Readings of several robots in one world, whose sonars see one another.
 
     Args:
-        states: leaves ``[r, ...]``.
+        states: leaves `[r, ...]`.
         params: one map, shared.
         active: robots that take part; the others are not there.
 
     Returns:
-        Reading with leaves ``[r, ...]``.
+        Reading with leaves `[r, ...]`.
     """
     centres = jnp.stack([states.x, states.y], axis=1)
     discs = _seen_by_each(states, jnp.zeros_like(centres), active)
@@ -365,13 +365,13 @@ def step_many(
     robot that something else stops earlier in the same step is still met where it was heading.
 
     Args:
-        states: leaves ``[r, ...]``.
+        states: leaves `[r, ...]`.
         steering: turn of each robot [deg].
         params: one map, shared.
         active: robots that take part; the others stay as they are and are not there.
 
     Returns:
-        States and Outcomes with leaves ``[r, ...]``; no flag of an inactive robot is set.
+        States and Outcomes with leaves `[r, ...]`; no flag of an inactive robot is set.
     """
     _, moves = jax.vmap(lambda s, a: _heading_and_move(s, a, params))(states, steering)
     discs = _seen_by_each(states, moves, active)

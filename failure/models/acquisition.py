@@ -37,8 +37,8 @@ _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)
 class AcquisitionConfig:
     """Which acquisition, and how hard to search for its maximum.
 
-    ``n_raw`` random points are ranked, the best ``n_restarts`` are improved by at most
-    ``max_evals`` evaluations each. Half of the raw points lie around the best inputs so far: in
+    `n_raw` random points are ranked, the best `n_restarts` are improved by at most
+    `max_evals` evaluations each. Half of the raw points lie around the best inputs so far: in
     60 dimensions uniform points almost never start an ascent that ends well.
     """
 
@@ -65,7 +65,7 @@ class AcquisitionConfig:
 
 
 def _tail_fraction(z: Array) -> Array:
-    r"""The continued fraction ``c`` with :math:`\Phi(z) / \phi(z) = 1 / (|z| + c)`, for z <= -4.
+    r"""The continued fraction `c` with :math:`\Phi(z) / \phi(z) = 1 / (|z| + c)`, for z <= -4.
 
     Laplace's fraction :math:`c = 1/(x + 2/(x + 3/(x + \dots)))`; 20 terms leave no error in
     float64 from x = 4 on.
@@ -84,12 +84,12 @@ def log_h(z: Float[Array, "..."]) -> Float[Array, "..."]:
     .. math::
         h(z) = \phi(z) + z \Phi(z) = \phi(z) \, \frac{c(z)}{|z| + c(z)} \quad (z < 0)
 
-    directly for z > -4; below through the continued fraction ``c`` of the Mills ratio, in which
+    directly for z > -4; below through the continued fraction `c` of the Mills ratio, in which
     the cancellation between the two terms is done on paper. Finite and with a useful slope where
-    ``h`` underflows.
+    `h` underflows.
 
     Source: Ament et al. (2023), Equation 9. Deviation: the continued fraction in the place of
-    ``erfcx``.
+    `erfcx`.
 
     Example:
         >>> round(float(log_h(jnp.asarray(0.0))), 4)
@@ -117,7 +117,7 @@ def _log_h_jvp(primals: tuple[Array,], tangents: tuple[Array,]) -> tuple[Array, 
 def log_ei(
     mean: Float[Array, "..."], sd: Float[Array, "..."], best: Float[Array, ""]
 ) -> Float[Array, "..."]:
-    r"""Log expected improvement over ``best``: :math:`\log h((\mu - y^*) / \sigma) + \log\sigma`.
+    r"""Log expected improvement over `best`: :math:`\log h((\mu - y^*) / \sigma) + \log\sigma`.
 
     Source: Ament et al. (2023), Equation 8.
     """
@@ -216,12 +216,12 @@ def propose(
         posterior: the conditioned GP.
         domain: where to look.
         best: best (standardised) output so far.
-        raw: candidate starts, from :func:`raw_points`.
+        raw: candidate starts, from `raw_points`.
         newton_steps: Newton steps that finish the three best ascents of each maximum. A search
             does without: the last tenth of a percent of the improvement does not move its points.
 
     Returns:
-        ``(points [q, d], acquisition values [q])``.
+        `(points [q, d], acquisition values [q])`.
     """
     weights = pbo_weights(config.batch_size).astype(posterior.x.dtype)
 

@@ -1,8 +1,8 @@
 """Exact Gaussian process on padded data: kernels, conditioning, growth by a point, prediction.
 
-Data sit in arrays of a few fixed sizes with a count ``n`` of the rows that are in use, so that a
+Data sit in arrays of a few fixed sizes with a count `n` of the rows that are in use, so that a
 search that adds one point per iteration compiles a handful of programs, not hundreds. Everything
-is a pure function; call it in float64 (``with jax.enable_x64(True)``), where a Cholesky
+is a pure function; call it in float64 (`with jax.enable_x64(True)`), where a Cholesky
 factorisation of a 300-point kernel matrix is safe.
 """
 
@@ -60,9 +60,9 @@ class GPConfig:
 
 
 class GPParams(NamedTuple):
-    """Hyper-parameters: ``log_lengthscale [d]``, ``log_noise`` and ``mean``.
+    """Hyper-parameters: `log_lengthscale [d]`, `log_noise` and `mean`.
 
-    The noise variance is ``exp(log_noise) + min_noise``, so it never leaves its range.
+    The noise variance is `exp(log_noise) + min_noise`, so it never leaves its range.
     """
 
     log_lengthscale: Array
@@ -71,7 +71,7 @@ class GPParams(NamedTuple):
 
 
 class Posterior(NamedTuple):
-    """A conditioned GP: parameters, padded data, ``linv`` (inverse Cholesky factor), ``alpha``."""
+    """A conditioned GP: parameters, padded data, `linv` (inverse Cholesky factor), `alpha`."""
 
     params: GPParams
     x: Array
@@ -82,7 +82,7 @@ class Posterior(NamedTuple):
 
 
 def padded_size(n: int) -> int:
-    """The smallest of the padded sizes that holds ``n`` points (multiples of 128 above 320).
+    """The smallest of the padded sizes that holds `n` points (multiples of 128 above 320).
 
     Example:
         >>> padded_size(50), padded_size(65), padded_size(330)
@@ -100,7 +100,7 @@ def standardize(
     """Masked outputs with mean 0 and standard deviation 1 (n - 1 in the denominator).
 
     Returns:
-        ``(standardised y with zeros where masked, mean, standard deviation)``.
+        `(standardised y with zeros where masked, mean, standard deviation)`.
     """
     n = jnp.sum(mask)
     mean = jnp.sum(jnp.where(mask > 0, y, jnp.zeros_like(y))) / n
@@ -140,8 +140,8 @@ def kernel_matrix(
         k(r) = (1 + \sqrt5 r + \tfrac53 r^2) e^{-\sqrt5 r}, \quad
         r^2 = \sum_k (a_k - b_k)^2 / \ell_k^2
 
-    for Matern-5/2; :math:`e^{-r^2/2}` for ``rbf``; :math:`\sum_k a_k b_k / \ell_k^2` for
-    ``linear``. Signal variance is 1: the targets are standardised.
+    for Matern-5/2; :math:`e^{-r^2/2}` for `rbf`; :math:`\sum_k a_k b_k / \ell_k^2` for
+    `linear`. Signal variance is 1: the targets are standardised.
 
     Source: Rasmussen and Williams (2006), Equations 4.17, 4.9 and 4.29.
     """
@@ -184,7 +184,7 @@ def _invert_lower(factor: Array) -> Array:
 
 
 def _gram_of_lower(linv: Array) -> Array:
-    """``linv.T @ linv`` of a lower triangle, by halves."""
+    """`linv.T @ linv` of a lower triangle, by halves."""
     n = linv.shape[0]
     if n <= 64 or n % 2:
         return linv.T @ linv
@@ -212,7 +212,7 @@ def condition(
     y: Float[Array, " n"],
     n: Int[Array, ""],
 ) -> Posterior:
-    """Condition on the first ``n`` rows by a full factorisation."""
+    """Condition on the first `n` rows by a full factorisation."""
     mask = _mask(x, n)
     k = kernel_matrix(config, params, x, x)
     linv, _ = _inverse_factor(_covariance(k, _noise(config, params), mask))
@@ -233,16 +233,16 @@ def append(
         L^{-1}_{n+1} = \begin{pmatrix} L^{-1} & 0 \\ -l^\top L^{-1} / \lambda & 1 / \lambda
         \end{pmatrix}
 
-    Quadratic in ``n``, where a new factorisation is cubic.
+    Quadratic in `n`, where a new factorisation is cubic.
 
     Args:
         config: kernel and priors.
-        posterior: the GP on ``n`` points.
+        posterior: the GP on `n` points.
         x_new: the new input.
-        y: all outputs, re-standardised, the new one in row ``n``.
+        y: all outputs, re-standardised, the new one in row `n`.
 
     Returns:
-        The GP on ``n + 1`` points.
+        The GP on `n + 1` points.
     """
     params, n, linv = posterior.params, posterior.n, posterior.linv
     mask = _mask(posterior.x, n)

@@ -66,7 +66,7 @@ def log_marginal_likelihood(
     y: Float[Array, " n"],
     n: Int[Array, ""],
 ) -> Float[Array, ""]:
-    r"""Log evidence of the first ``n`` rows.
+    r"""Log evidence of the first `n` rows.
 
     .. math::
         \log p(y) = -\tfrac12 (y - m)^\top K_y^{-1} (y - m) - \tfrac12 \log |K_y|
@@ -121,18 +121,18 @@ def map_value_and_grad(
         \big((\alpha \alpha^\top - K_y^{-1}) \, \partial_\theta K_y\big)
 
     The derivative along all lengthscales costs two matrix products, since
-    :math:`\sum_{ij} G_{ij} (s_{ik} - s_{jk})^2` expands into row sums of ``G`` and ``G s``. The
+    :math:`\sum_{ij} G_{ij} (s_{ik} - s_{jk})^2` expands into row sums of `G` and `G s`. The
     mean is profiled out, so it adds no term to the gradient (envelope theorem).
 
     Args:
         config: kernel and priors.
-        theta: ``[log_lengthscale, log_noise]``.
+        theta: `[log_lengthscale, log_noise]`.
         x: inputs, padded.
         y: standardised outputs, padded.
         n: rows in use.
 
     Returns:
-        ``(-map_objective, gradient, mean)``.
+        `(-map_objective, gradient, mean)`.
 
     Source: Rasmussen and Williams (2006), Equation 5.9.
     """
@@ -181,22 +181,22 @@ def fit(
     gtol: float = 1e-4,
     ftol: float = 1e-7,
 ) -> FitResult:
-    """Maximise the MAP objective from ``start`` (and from the curvature of an earlier fit).
+    """Maximise the MAP objective from `start` (and from the curvature of an earlier fit).
 
     Args:
         config: kernel and priors.
         x: inputs, padded.
         y: standardised outputs, padded.
         n: rows in use.
-        start: parameters of the last fit, or :func:`initial_params`.
+        start: parameters of the last fit, or `initial_params`.
         hessian_inverse: of the last fit; two or three evaluations then often do.
-        fresh: see :func:`failure.models.optimize.bfgs`.
+        fresh: see `failure.models.optimize.bfgs`.
         max_evals: evaluations at most.
         gtol: gradient tolerance of the per-point objective.
         ftol: relative gain below which two steps in a row end the fit.
 
     Returns:
-        FitResult; ``value`` is the MAP objective per data point.
+        FitResult; `value` is the MAP objective per data point.
     """
     dim = x.shape[1]
     theta = jnp.concatenate([start.log_lengthscale, start.log_noise[None]])

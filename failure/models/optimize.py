@@ -13,7 +13,7 @@ __all__ = ["BFGSResult", "Domain", "ball", "bfgs", "box", "polish", "project", "
 
 
 class Domain(NamedTuple):
-    """The set ``lower <= x <= upper``, ``|x| <= radius`` (infinite bounds switch a part off)."""
+    """The set `lower <= x <= upper`, `|x| <= radius` (infinite bounds switch a part off)."""
 
     lower: Array
     upper: Array
@@ -21,7 +21,7 @@ class Domain(NamedTuple):
 
 
 class BFGSResult(NamedTuple):
-    """Where :func:`bfgs` stopped; ``hessian_inverse`` warm-starts the next call."""
+    """Where `bfgs` stopped; `hessian_inverse` warm-starts the next call."""
 
     x: Float[Array, " d"]
     value: Float[Array, ""]
@@ -89,7 +89,7 @@ def sample(domain: Domain, key: Key[Array, ""], n: int) -> Float[Array, "n d"]:
 
 
 def _tangent(domain: Domain, x: Array, v: Array) -> Array:
-    """The part of the move ``v`` that does not leave the set at ``x``."""
+    """The part of the move `v` that does not leave the set at `x`."""
     blocked = ((x <= domain.lower) & (v < 0)) | ((x >= domain.upper) & (v > 0))
     v = jnp.where(blocked, jnp.zeros_like(v), v)
     norm2 = x @ x
@@ -119,24 +119,24 @@ def bfgs(
 
     with :math:`P` the projection on the feasible moves and :math:`\rho = 1 / s^\top y`. Every
     turn of the loop spends exactly one evaluation, on a new step or on a shorter one, so under
-    ``vmap`` no lane waits for another's line search. The dense ``H`` beats a limited memory at
+    `vmap` no lane waits for another's line search. The dense `H` beats a limited memory at
     the sizes here (up to a few hundred unknowns).
 
     Args:
-        value_and_grad: ``x -> (value, gradient, aux)``; ``aux`` of the best point comes back.
+        value_and_grad: `x -> (value, gradient, aux)`; `aux` of the best point comes back.
         x0: start, inside the domain.
         domain: the feasible set.
-        max_evals: evaluations at most, the one at ``x0`` included.
-        hessian_inverse: ``H`` of an earlier call, to go on from, or (with ``fresh``) a metric that
+        max_evals: evaluations at most, the one at `x0` included.
+        hessian_inverse: `H` of an earlier call, to go on from, or (with `fresh`) a metric that
             makes the coordinates comparable; the identity without.
-        fresh: whether to rescale ``H`` at the first step; true without ``hessian_inverse``. Traced,
+        fresh: whether to rescale `H` at the first step; true without `hessian_inverse`. Traced,
             so that cold and warm starts are one program.
         max_move: longest step per coordinate.
         gtol: stop when the projected gradient is below it (infinity norm).
         ftol: stop after two accepted steps in a row whose relative gain is below it.
 
     Returns:
-        BFGSResult; ``converged`` is false when ``max_evals`` ended the descent.
+        BFGSResult; `converged` is false when `max_evals` ended the descent.
 
     Source: Nocedal and Wright (2006), Equation 6.17 and Algorithm 3.1; Bertsekas (1982) for the
     two-metric projection. Deviation: no curvature condition in the line search; pairs with
@@ -251,7 +251,7 @@ def polish(
         steps: Newton steps.
 
     Returns:
-        ``(x, value)``.
+        `(x, value)`.
 
     Source: Bertsekas (1982), two-metric projection; Nocedal and Wright (2006), Section 3.4.
     """

@@ -15,7 +15,7 @@ __all__ = ["gradient_corner", "monte_carlo", "ridge", "ridge_corner", "uniform",
 
 
 def uniform(rng: np.random.Generator, task: Task, n: int) -> np.ndarray:
-    """``n`` uniform points of the task's set, ``[n, D]``."""
+    """`n` uniform points of the task's set, `[n, D]`."""
     if task.kind == "box":
         return rng.uniform(-task.size, task.size, (n, task.dim))
     normal = rng.normal(size=(n, task.dim))
@@ -24,7 +24,7 @@ def uniform(rng: np.random.Generator, task: Task, n: int) -> np.ndarray:
 
 
 def worst_corner(task: Task, slope: np.ndarray) -> np.ndarray:
-    """Where a function of slope ``[D]`` is largest: at a corner, or on the sphere along it."""
+    """Where a function of slope `[D]` is largest: at a corner, or on the sphere along it."""
     if task.kind == "box":
         return task.size * np.where(slope >= 0, 1.0, -1.0)
     return task.size * slope / max(float(np.linalg.norm(slope)), 1e-300)
@@ -36,12 +36,12 @@ def ridge(
     """Ridge regression with an intercept on standardised outputs.
 
     Args:
-        x: inputs scaled to unit variance, ``[n, D]``.
-        y: outputs, ``[n]``.
+        x: inputs scaled to unit variance, `[n, D]`.
+        y: outputs, `[n]`.
         penalty: ratio of noise to prior variance of a slope.
 
     Returns:
-        ``(slopes, their covariance, noise variance)`` in units of the standardised output.
+        `(slopes, their covariance, noise variance)` in units of the standardised output.
     """
     sd = float(y.std()) or 1.0
     centred, target = x - x.mean(0), (y - y.mean()) / sd
@@ -54,7 +54,7 @@ def ridge(
 
 
 def monte_carlo(rng: np.random.Generator, task: Task, n_left: int) -> np.ndarray:
-    """The next block of uniform points, ``[min(50, n_left), D]``."""
+    """The next block of uniform points, `[min(50, n_left), D]`."""
     return uniform(rng, task, min(50, n_left))
 
 
@@ -64,11 +64,11 @@ def ridge_corner(rng: np.random.Generator, task: Task, x: np.ndarray, y: np.ndar
     Args:
         rng: random numbers of this iteration.
         task: the feasible set.
-        x: inputs so far ``[n, D]``.
+        x: inputs so far `[n, D]`.
         y: outputs so far, NaN where invalid.
 
     Returns:
-        ``[1, D]``.
+        `[1, D]`.
     """
     scale = task.size / (math.sqrt(3.0) if task.kind == "box" else math.sqrt(task.dim + 2.0))
     good = np.isfinite(y)
@@ -100,7 +100,7 @@ def gradient_corner(
         n_left: simulations left.
 
     Returns:
-        ``[D + 1, D]`` or ``[1, D]``.
+        `[D + 1, D]` or `[1, D]`.
     """
     dim = task.dim
     step = 0.05 * task.size * (1.0 if task.kind == "box" else math.sqrt(3.0 / (dim + 2.0)))

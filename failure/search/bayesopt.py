@@ -65,7 +65,7 @@ FIT_FTOL = 1e-6
 
 
 def _keys(config: SearchConfig, n: int) -> Any:
-    """One key per seed for the iteration that follows ``n`` evaluations."""
+    """One key per seed for the iteration that follows `n` evaluations."""
     keys = [jax.random.fold_in(jax.random.key(seed), n) for seed in config.seeds]
     return jnp.stack(keys)
 
@@ -97,7 +97,7 @@ def _programs(
 
 @jax.jit
 def _decode(space: Any, domain: Domain, u: Any) -> Any:
-    """``u [S, q, d]`` to ``(x [S, q, D], clipped [S, q])``."""
+    """`u [S, q, d]` to `(x [S, q, D], clipped [S, q])`."""
     return jax.vmap(lambda s, block: jax.vmap(partial(decode, s, domain))(block))(space, u)
 
 
@@ -158,7 +158,7 @@ def _baseline(config: SearchConfig, state: SearchState) -> SearchState:
 
 
 def _targets(state: SearchState, size: int) -> tuple[np.ndarray, np.ndarray]:
-    """Standardised outputs, padded to ``size``, and the best valid one per seed.
+    """Standardised outputs, padded to `size`, and the best valid one per seed.
 
     An invalid evaluation gets the mean of the valid ones: the surrogate then knows that the place
     has been tried, and neither seeks nor shuns it.
@@ -269,13 +269,13 @@ def _learn_space(config: SearchConfig, state: SearchState, train: TrainSpace | N
 def describe(
     config: SearchConfig, state: SearchState, asked: list[Any] | None = None
 ) -> SearchState:
-    """Give a history of ``x`` and ``y`` its coordinates in the search space.
+    """Give a history of `x` and `y` its coordinates in the search space.
 
     Args:
         config: the search.
-        state: with ``x``; ``space`` is made where it needs no data.
-        asked: unit coordinates of the evaluations after ``space_at``, in blocks ``[S, q, d]``;
-            what was not asked in this space is encoded from ``x``.
+        state: with `x`; `space` is made where it needs no data.
+        asked: unit coordinates of the evaluations after `space_at`, in blocks `[S, q, d]`;
+            what was not asked in this space is encoded from `x`.
     """
     with jax.enable_x64(True):
         space = state.space if state.space is not None else _first_space(config)
@@ -297,10 +297,10 @@ def ask(
     Args:
         config: the search.
         state: history; points that are already asked are returned again.
-        train: how Rev-ARGate spaces are trained; :func:`failure.rev_argate.train_space` without.
+        train: how Rev-ARGate spaces are trained; `failure.rev_argate.train_space` without.
 
     Returns:
-        ``(x [S, q, D] in sigma, state)``.
+        `(x [S, q, D] in sigma, state)`.
 
     Raises:
         ValueError: the budget is spent.
@@ -334,9 +334,9 @@ def tell(
 
     Args:
         config: the search.
-        state: with pending points ``[S, q, D]``.
-        y: ``[S, q]``, larger is worse; a value that is not finite counts as invalid.
-        status: ``[S, q]``, 0 where valid; all zero without.
+        state: with pending points `[S, q, D]`.
+        y: `[S, q]`, larger is worse; a value that is not finite counts as invalid.
+        status: `[S, q]`, 0 where valid; all zero without.
 
     Raises:
         ValueError: nothing was asked, or the shape is another.

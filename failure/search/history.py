@@ -55,10 +55,10 @@ METHODS: dict[str, Method] = {
 class SearchConfig:
     """What defines a search: task, method, seeds and budget (50 + 250, as in the source).
 
-    ``refit_every`` counts evaluations between fits of the hyper-parameters once there are more
-    than ``2 n_init`` of them; in between points are appended to the factorisation.
-    ``retrain_every`` counts evaluations between trainings of a Rev-ARGate (0: once, on the initial
-    ones); all of them count towards the budget. ``rev_argate`` is its RevArgateConfig, or None.
+    `refit_every` counts evaluations between fits of the hyper-parameters once there are more
+    than `2 n_init` of them; in between points are appended to the factorisation.
+    `retrain_every` counts evaluations between trainings of a Rev-ARGate (0: once, on the initial
+    ones); all of them count towards the budget. `rev_argate` is its RevArgateConfig, or None.
     """
 
     task: Task
@@ -116,15 +116,15 @@ class Surrogate(NamedTuple):
 
 
 class SearchState(NamedTuple):
-    """History with a leading seed axis ``S``; ``n`` evaluations are complete, the rest is asked.
+    """History with a leading seed axis `S`; `n` evaluations are complete, the rest is asked.
 
     Attributes:
-        x: ``[S, n, D]`` parameters in sigma.
-        u: ``[S, n, d]`` unit coordinates of the search space (empty for baselines).
-        y: ``[S, n]`` outputs; NaN where the simulator gave none.
-        status: ``[S, n]``; 0 valid.
-        clipped: ``[S, n]`` share of coordinates that restoration put outside the set.
-        pending: ``(x, u, clipped)`` that wait for :func:`tell`, or None.
+        x: `[S, n, D]` parameters in sigma.
+        u: `[S, n, d]` unit coordinates of the search space (empty for baselines).
+        y: `[S, n]` outputs; NaN where the simulator gave none.
+        status: `[S, n]`; 0 valid.
+        clipped: `[S, n]` share of coordinates that restoration put outside the set.
+        pending: `(x, u, clipped)` that wait for `tell`, or None.
         space: the search space, stacked over seeds; None until it is known.
         space_at: evaluations the space was made from.
         surrogate: of the last ask, or None.
@@ -161,12 +161,12 @@ def init(config: SearchConfig) -> SearchState:
 
 
 def best_so_far(y: np.ndarray) -> np.ndarray:
-    """Running worst case ``[S, n]``; -inf before the first valid evaluation."""
+    """Running worst case `[S, n]`; -inf before the first valid evaluation."""
     return np.maximum.accumulate(np.where(np.isfinite(y), y, -np.inf), axis=1)
 
 
 def first_hit(y: np.ndarray, threshold: float) -> np.ndarray:
-    """Simulations up to and with the first failure (``y > threshold``) per seed, NaN for none.
+    """Simulations up to and with the first failure (`y > threshold`) per seed, NaN for none.
 
     Example:
         >>> first_hit(np.array([[0.0, 2.0, 3.0], [0.0, 0.0, 1.0]]), 1.5).tolist()

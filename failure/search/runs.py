@@ -33,14 +33,14 @@ def evaluate(
     """Simulate the points of all seeds in one batch; try failed ones again; never raise for them.
 
     Args:
-        simulate: ``x [n, D] -> (specs [n, m], status [n])``.
+        simulate: `x [n, D] -> (specs [n, m], status [n])`.
         column: which specification.
-        x: ``[S, q, D]``.
+        x: `[S, q, D]`.
         sense: "max" when larger is worse, "min" when smaller is.
         retries: further attempts at points whose simulation failed.
 
     Returns:
-        ``(y [S, q], larger is worse, NaN where invalid; status [S, q])``.
+        `(y [S, q], larger is worse, NaN where invalid; status [S, q])`.
     """
     flat = np.asarray(x).reshape(-1, x.shape[-1])
     y, status = np.full(len(flat), np.nan), np.ones(len(flat), np.int64)
@@ -67,8 +67,8 @@ def start_from(config: SearchConfig, x: np.ndarray, y: np.ndarray) -> SearchStat
 
     Args:
         config: a search in the full space or a Rev-ARGate one, or a baseline.
-        x: ``[n, D]`` in sigma.
-        y: ``[n]``, larger is worse.
+        x: `[n, D]` in sigma.
+        y: `[n]`, larger is worse.
 
     Raises:
         ValueError: wrong shapes; a row that is not finite or lies outside the set, named; a
@@ -140,7 +140,7 @@ def _claim(folder: Path, config: SearchConfig) -> None:
 
 
 def _append(folder: Path, state: SearchState, count: int) -> None:
-    """Log the last ``count`` evaluations; one line, flushed to the disk."""
+    """Log the last `count` evaluations; one line, flushed to the disk."""
     rows = slice(state.n - count, state.n)
     line = {
         "n": state.n - count,
@@ -234,21 +234,21 @@ def run(
 
     Args:
         config: the search.
-        simulate: ``x [n, D] -> (specs [n, m], status [n])``; all seeds' points come in one batch.
+        simulate: `x [n, D] -> (specs [n, m], status [n])`; all seeds' points come in one batch.
         column: which specification.
         sense: "max" when larger is worse.
         folder: where the run is written; a run that is in it goes on, without repeating a
             simulation. Nothing is written without.
-        state: a history to start from (:func:`start_from`), for a run without a folder.
+        state: a history to start from (`start_from`), for a run without a folder.
         retries: further attempts at a point whose simulation failed.
         on_step: called after every batch.
-        train: see :func:`failure.search.bayesopt.ask`.
+        train: see `failure.search.bayesopt.ask`.
 
     Returns:
         The complete history.
 
     Raises:
-        ValueError: ``folder`` holds a run with other settings.
+        ValueError: `folder` holds a run with other settings.
 
     Example:
         >>> def simulate(x):

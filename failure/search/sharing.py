@@ -78,15 +78,15 @@ def side_by_side(
 
     Args:
         searches: each takes a simulator and returns its result, as
-            ``lambda simulate: runs.run(config, simulate, folder=folder)``.
-        simulate: ``x [n, D] -> (specs [n, m], status [n])``; called from one thread only.
+            `lambda simulate: runs.run(config, simulate, folder=folder)`.
+        simulate: `x [n, D] -> (specs [n, m], status [n])`; called from one thread only.
         multiple: the last point is repeated until a batch is a multiple of this.
 
     Returns:
         The results, in the order of the searches.
 
     Raises:
-        ValueError: ``multiple`` below 1.
+        ValueError: `multiple` below 1.
         Exception: the first one that a search raised, after the others have ended.
 
     Example:

@@ -1,8 +1,8 @@
 """Search spaces: how a point of the surrogate's space becomes a parameter variation.
 
-A surrogate works on unit coordinates ``u``, in which the initial design has variance 1/12 per
+A surrogate works on unit coordinates `u`, in which the initial design has variance 1/12 per
 coordinate (that of a unit cube), whatever the task: then one lengthscale prior serves them all.
-``decode`` maps ``u`` to the parameters ``x`` in sigma.
+`decode` maps `u` to the parameters `x` in sigma.
 """
 
 from __future__ import annotations
@@ -34,7 +34,7 @@ __all__ = [
 
 
 class Task(NamedTuple):
-    """Where failures are looked for: ``kind`` "box" (half width) or "ball" (radius), in sigma."""
+    """Where failures are looked for: `kind` "box" (half width) or "ball" (radius), in sigma."""
 
     kind: str
     size: float
@@ -42,13 +42,13 @@ class Task(NamedTuple):
 
 
 class FullSpace(NamedTuple):
-    """Every parameter is a coordinate: ``x = scale u``."""
+    """Every parameter is a coordinate: `x = scale u`."""
 
     scale: Array
 
 
 class RandomEmbedding(NamedTuple):
-    """HDBO: ``x = P(unit A z)``, ``z = 2 sqrt(d) u`` in ``[-sqrt d, sqrt d]^d``."""
+    """HDBO: `x = P(unit A z)`, `z = 2 sqrt(d) u` in `[-sqrt d, sqrt d]^d`."""
 
     matrix: Array
     unit: Array
@@ -59,10 +59,10 @@ class ReversedFeatures(NamedTuple):
 
     Attributes:
         network: RevNet weights.
-        order: ``[D]``, feature numbers, the active ones first.
-        shift: ``[d]``, middle of the range of the active features.
-        scale: ``[d]``, width of that range.
-        x_scale: the RevNet sees ``x / x_scale``.
+        order: `[D]`, feature numbers, the active ones first.
+        shift: `[d]`, middle of the range of the active features.
+        scale: `[d]`, width of that range.
+        x_scale: the RevNet sees `x / x_scale`.
         restoration: network from active to inactive features, or None for zeros.
     """
 
@@ -94,7 +94,7 @@ def task_domain(task: Task) -> Domain:
 
 
 def unit_scale(task: Task) -> float:
-    r"""Parameters per unit coordinate: :math:`x = c\,u` with variance 1/12 of ``u``.
+    r"""Parameters per unit coordinate: :math:`x = c\,u` with variance 1/12 of `u`.
 
     A coordinate of a uniform point has variance :math:`b^2/3` in a box of half width b and
     :math:`r^2/(D+2)` in a ball of radius r.
@@ -114,13 +114,13 @@ def random_embedding(key: Key[Array, ""], task: Task, dim: int) -> RandomEmbeddi
     .. math:: x = P_\Omega(b A z), \quad A \in \mathbb R^{D \times d}, \quad
         z \in [-\sqrt d, \sqrt d]^d
 
-    ``b`` is the half width of the box, the unit in which REMBO's box is [-1, 1]; for the ball it
-    is ``sqrt(3)`` standard deviations of a coordinate, so that both tasks clip alike.
+    `b` is the half width of the box, the unit in which REMBO's box is [-1, 1]; for the ball it
+    is `sqrt(3)` standard deviations of a coordinate, so that both tasks clip alike.
 
     Raises:
-        ValueError: ``dim`` is not in 1 ... D.
+        ValueError: `dim` is not in 1 ... D.
 
-    Source: M. S. Shim (2020), Section 4.1; Wang et al. (2016), REMBO.
+    Source: Shim (2020), Section 4.1; Wang et al. (2016), REMBO.
     """
     if not 1 <= dim <= task.dim:
         raise ValueError(f"embedding_dim={dim}: expected 1 ... {task.dim}")
@@ -129,7 +129,7 @@ def random_embedding(key: Key[Array, ""], task: Task, dim: int) -> RandomEmbeddi
 
 
 def search_domain(space: Space, task: Task) -> Domain:
-    """The feasible set of ``u``: the unit cube, or a ball for the full space of a ball task."""
+    """The feasible set of `u`: the unit cube, or a ball for the full space of a ball task."""
     if isinstance(space, FullSpace) and task.kind == "ball":
         return ball(task.dim, task.size / unit_scale(task))
     if isinstance(space, FullSpace):
@@ -149,13 +149,13 @@ def decode(
 
     Args:
         space: the search space.
-        domain: feasible set of x, from :func:`task_domain`.
+        domain: feasible set of x, from `task_domain`.
         u: unit coordinates.
 
     Returns:
-        ``(x, clipped share)``; x always lies in the domain.
+        `(x, clipped share)`; x always lies in the domain.
 
-    Source: M. S. Shim (2020), Sections 4.1 and 4.4. Deviation: a restored x may leave the box
+    Source: Shim (2020), Sections 4.1 and 4.4. Deviation: a restored x may leave the box
     (features are unbounded); it is projected and the share reported.
     """
     if isinstance(space, FullSpace):

@@ -47,7 +47,7 @@ def reachable(
     set a threshold that is known to be reachable.
 
     Args:
-        run: pure ``x [n, D] -> (specs [n, m], status [n])``, differentiable.
+        run: pure `x [n, D] -> (specs [n, m], status [n])`, differentiable.
         column: which specification.
         task: the feasible set.
         sense: "max" when larger is worse, "min" when smaller is.
@@ -58,7 +58,7 @@ def reachable(
         seed: of the random starts.
 
     Raises:
-        ValueError: ``share`` is not in (0, 1).
+        ValueError: `share` is not in (0, 1).
     """
     if not 0.0 < share < 1.0:
         raise ValueError(f"share={share}: expected a number between 0 and 1")

@@ -26,9 +26,9 @@ class TurboConfig:
 
 
 def region_length(config: TurboConfig, y: np.ndarray, n_init: int, dim: int) -> float:
-    """Length of the trust region after the evaluations ``y [n]``, replayed from the start.
+    """Length of the trust region after the evaluations `y [n]`, replayed from the start.
 
-    Three improvements in a row double it, ``max(4, d)`` disappointments in a row halve it; below
+    Three improvements in a row double it, `max(4, d)` disappointments in a row halve it; below
     the least length it starts again. Replaying makes the region part of the history: nothing has
     to be stored to resume.
 
@@ -72,7 +72,7 @@ def trust_region(
     length: Float[Array, ""],
     log_lengthscale: Float[Array, " d"],
 ) -> Domain:
-    r"""A box around ``centre`` whose sides follow the lengthscales, volume ``length ** d``.
+    r"""A box around `centre` whose sides follow the lengthscales, volume `length ** d`.
 
     .. math:: L_k = L\, \ell_k / \big(\textstyle\prod_j \ell_j\big)^{1/d}
 

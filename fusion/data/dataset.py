@@ -105,7 +105,7 @@ def apply_scale(x: np.ndarray, scale: Scale) -> np.ndarray:
 
     .. math:: x' = \mathrm{clip}\left(2\,\frac{x - l_k}{h_k - l_k} - 1,\; -1,\; 1\right)
 
-    Symbols: :math:`l_k, h_k` are ``scale.low`` and ``scale.high`` of channel k; x is `[N, K, T]`.
+    Symbols: :math:`l_k, h_k` are `scale.low` and `scale.high` of channel k; x is `[N, K, T]`.
     Clipping touches test rows only (no training value lies outside) and keeps every clean input in
     [-1, 1], so that no range check can tell a clean channel from a failed one.
 

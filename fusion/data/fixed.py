@@ -60,7 +60,7 @@ def published_fixed(
     Raises:
         ValueError: no set with this `n_clean` was published for the data set.
 
-    Source: dissertation, Tables 3.2 and 3.4 and the text above them.
+    Source: Shim (2020), Tables 3.2 and 3.4 and the text above them.
     Deviation: the source's lists contradict its counts; the sets used are those in this module.
     """
     sets = fixed_sets(dataset)

@@ -152,8 +152,8 @@ def bayes_accuracy(
         \exp\left(-\frac{n}{n+1} \frac{\gamma}{2}\right), \qquad
         \gamma = a_S^H \left(\Sigma_{SS} + \sigma_\epsilon^2 I\right)^{-1} a_S
 
-    Symbols: S is ``sensors`` (None = all, empty = chance); :math:`a_k` here is the complex
-    amplitude :math:`a_k e^{i\varphi_k}`; C is ``config.n_classes``. Scaling to [-1, 1] keeps it.
+    Symbols: S is `sensors` (None = all, empty = chance); :math:`a_k` here is the complex
+    amplitude :math:`a_k e^{i\varphi_k}`; C is `config.n_classes`. Scaling to [-1, 1] keeps it.
 
     Source: Proakis (2001), Digital Communications, 4th edition, section 5.4: probability of a
     correct decision for non-coherent detection of orthogonal signals, with the sensors combined by

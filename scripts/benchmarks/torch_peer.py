@@ -1,6 +1,6 @@
 """The late-fusion HAR network in PyTorch, twice: as a user would write it, and with grouped layers.
 
-Both compute what `fusion.models.FusionNet` computes for ``model="baseline"``; `load_parameters`
+Both compute what `fusion.models.FusionNet` computes for `model="baseline"`; `load_parameters`
 copies the parameters of one into the other, so that the benchmark can show it.
 """
 
@@ -187,7 +187,7 @@ def load_parameters(net: LoopNet | GroupedNet, main: dict[str, Any]) -> None:
 def train_epoch(
     net: nn.Module, optimizer: torch.optim.Optimizer, config: Any, rate: Callable[[int], float]
 ) -> Callable[[Tensor, Tensor], float]:
-    """Build ``epoch(x, y) -> mean loss``: shuffled batches, clipping, decoupled weight decay.
+    """Build `epoch(x, y) -> mean loss`: shuffled batches, clipping, decoupled weight decay.
 
     Args:
         net, optimizer: to train; the optimizer is `torch.optim.AdamW`.

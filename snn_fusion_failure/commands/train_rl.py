@@ -208,7 +208,7 @@ def _compiled(one: Any, config: Config) -> Any:
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Train and test on every scenario asked for; returns ``{scenario: {metric: summary}}``."""
+    """Train and test on every scenario asked for; returns `{scenario: {metric: summary}}`."""
     if config.seeds < 1 or config.test_trials < 1:
         raise ValueError(
             f"seeds = {config.seeds} and test_trials = {config.test_trials} must be >= 1"

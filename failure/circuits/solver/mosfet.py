@@ -95,8 +95,8 @@ def mos_params(
     .. math:: \beta = \mu \frac{\epsilon_{ox}}{t_{ox}} \frac{W}{L}, \quad \lambda = \lambda_L / L,
         \quad C_{gs} = \tfrac23 W L \frac{\epsilon_{ox}}{t_{ox}} + C_{ov} W, \quad C_{gd} = C_{ov} W
 
-    Symbols: :math:`\mu` ``mobility`` [m^2/(V s)]; :math:`\lambda_L` ``early`` [m/V];
-    :math:`C_{ov}` ``overlap`` [F/m]; :math:`W, L, t_{ox}` [m]; ``vto`` [V] passes through.
+    Symbols: :math:`\mu` `mobility` [m^2/(V s)]; :math:`\lambda_L` `early` [m/V];
+    :math:`C_{ov}` `overlap` [F/m]; :math:`W, L, t_{ox}` [m]; `vto` [V] passes through.
 
     Returns:
         MosParams with leaves of the common shape of the arguments.

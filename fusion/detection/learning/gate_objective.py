@@ -13,7 +13,7 @@ with :math:`\ell_k` the mean of these class losses and :math:`\bar\ell_k` what i
 whole loss says how many objects a frame holds and how they stand, more than in which state its
 sensor is; and a sensor that alone is the weaker one, however well it works, is no failed sensor.
 
-Source: M. S. Shim (2020), Equation 3.2 and section 3.3.2.2. Deviations: the paths' second stage,
+Source: Shim (2020), Eq. 3.2 and section 3.3.2.2. Deviations: the paths' second stage,
 what the targets see (`DetectorConfig.auxiliary_second`, `balanced_paths`).
 """
 

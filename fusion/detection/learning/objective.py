@@ -8,7 +8,7 @@ r"""What training minimizes: the losses of both stages, and the gate's of Equati
 five terms. See
 `gate_objective` for the last three.
 
-Source: Ku et al. (2018), section III-E; M. S. Shim (2020), Equation 3.2 and section 3.3.2.2.
+Source: Ku et al. (2018), section III-E; Shim (2020), Eq. 3.2 and section 3.3.2.2.
 """
 
 from __future__ import annotations

@@ -182,7 +182,7 @@ def camera_failure(
         \beta = -\ln 0.05 \, s / 25 \mathrm{m}; \qquad
         \text{exposure: } I' = \min(2^{\pm 5 s} I^{2.2}, 1)^{1 / 2.2}
 
-    Symbols: :math:`I` is ``image``; :math:`s` is ``severity``; :math:`d` is ``depth`` [m], or 30 m
+    Symbols: :math:`I` is `image`; :math:`s` is `severity`; :math:`d` is `depth` [m], or 30 m
     everywhere; the airlight :math:`A` is 0.8; the sign of the exposure error is drawn.
 
     Args:

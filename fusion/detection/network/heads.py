@@ -51,7 +51,7 @@ class MapGate(nn.Module):
     died weighs all frames alike. `init_detector` starts the last layer at zero, that is from equal
     weights, as AVOD fuses.
 
-    Source: M. S. Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
+    Source: Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
     """
 
     width: int

@@ -6,8 +6,8 @@ SIM is a folder of simulated frames, RUNS/... are run folders of `scripts/train_
 or of `scripts/studies/study_detector.py`; runs of one model are seeds. On the validation frames it
 asks, given the true boxes, how often a car scores above a body that only its colour tells from a
 car: the scores of both stages, with all sensors working and with each failure of `--kinds`, and a
-linear reader of the image, of the camera's and of the lidar's features. 0.5 is chance. Prints a table and
-writes `results/study_views.json`. Two minutes a run on one core, most of it compiling.
+linear reader of the image, of the camera's and of the lidar's features. 0.5 is chance. Prints a
+table and writes `results/study_views.json`. Two minutes a run on one core, most of it compiling.
 """
 
 from __future__ import annotations

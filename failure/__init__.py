@@ -12,11 +12,13 @@ from failure.rare_events import importance_sampling, monte_carlo, subset_simulat
 from failure.search import baselines, bayesopt, runs, sharing, spaces, thresholds, turbo
 from failure.search.bayesopt import SearchConfig, ask, tell
 from failure.simulators.wrappers import CommandSimulator, FunctionSimulator
+from failure.status import Status
 
 __all__ = [
     "CommandSimulator",
     "FunctionSimulator",
     "SearchConfig",
+    "Status",
     "acquisition",
     "ask",
     "baselines",

@@ -40,5 +40,5 @@ _ADVICE = {
     Status.FAILED: "read the message of the sample; run its kept deck by hand",
     Status.TIMED_OUT: "raise timeout, or look at the kept deck and log",
     Status.NOT_FINITE: "say what a missing value means: a failure, or nothing (invalid)",
-    Status.NOT_CONVERGED: "the solver could not hold its accuracy: simulate the sample with ngspice",
+    Status.NOT_CONVERGED: "accuracy could not be held: simulate the sample with ngspice",
 }

@@ -1,0 +1,83 @@
+"""One convention each: order of arguments, keys by name, plots that return, plain backticks."""
+
+from __future__ import annotations
+
+import ast
+from pathlib import Path
+
+import pytest
+
+from tests import _conventions as conventions
+
+ROOT = Path(__file__).resolve().parent.parent
+KNOWN = set((ROOT / "tests" / "known_arguments.txt").read_text(encoding="utf-8").split())
+"""Functions that do not follow the order yet; only ever shorter."""
+FUNCTIONS = list(conventions.public_functions(*conventions.PACKAGES))
+
+
+def test_arguments_come_as_config_params_state_inputs_key() -> None:
+    found = {
+        name: faults
+        for name, node in FUNCTIONS
+        if name not in KNOWN and (faults := conventions.argument_faults(node))
+    }
+    assert found == {}
+
+
+@pytest.mark.parametrize(
+    ("code", "good"),
+    [
+        ("def f(config: C, params: P, state: S, x: Array, *, key: Key): ...", True),
+        ("def init(key: Key, config: C): ...", True),
+        ("def lif_init(params: LIFParams, n: int): ...", True),
+        ("def f(params: P, config: C): ...", False),
+        ("def f(model: ModelConfig, train: TrainParams, net: NetConfig): ...", False),
+        ("def f(x: Float[Array, 'n'], params: P): ...", False),
+        ("def f(key: Key, config: C): ...", False),
+        ("def init(config: C, key: Key): ...", False),
+        ("def f(make: Callable[[XConfig], int], params: P): ...", True),
+        ("def f(x: Array, params: P = P()): ...", True),
+    ],
+)
+def test_the_rule_itself(code: str, good: bool) -> None:
+    (node,) = ast.parse(code).body
+    assert isinstance(node, ast.FunctionDef)
+    assert (conventions.argument_faults(node) == []) is good
+
+
+KNOWN_PLOTS = {
+    "jaxsnn.plots.draw_map",
+    "jaxsnn.plots.map_figure",
+    "jaxsnn.plots.trajectories",
+    "jaxsnn.plots.learning_curves",
+    "jaxsnn.plots.stdp_curve",
+    "jaxsnn.plots.rm_stdp_curves",
+    "jaxsnn.plots.spike_raster",
+    "jaxsnn.plots.trial_gif",
+    "fusion.detection.simulator.plots.ground_corners",
+    "fusion.lattice.plots.plot_calibrator",
+    "fusion.lattice.plots.plot_categorical",
+    "fusion.lattice.plots.plot_lattice_slice",
+    "failure.plots.plot_trend",
+    "failure.plots.plot_activity",
+    "failure.plots.plot_shares",
+}
+
+
+def test_plots_return_a_figure_that_the_caller_saves() -> None:
+    for name, node in FUNCTIONS:
+        module, function = name.rsplit(".", 1)
+        if module.endswith("plots") and name not in KNOWN_PLOTS:
+            result = ast.unparse(node.returns).strip("'\"") if node.returns else ""
+            assert function.startswith("plot_"), name
+            assert result.split(".")[-1] in ("Figure", "FuncAnimation"), f"{name} -> {result}"
+
+
+def test_single_backticks() -> None:
+    found = {
+        str(path.relative_to(ROOT)): lines
+        for room in (*conventions.PACKAGES, "scripts")
+        for path in sorted((ROOT / room).rglob("*.py"))
+        if (lines := conventions.double_backticks(path))
+    }
+    assert found == {}

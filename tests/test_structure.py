@@ -177,9 +177,9 @@ def test_no_module_name_has_two_meanings() -> None:
     held = collections.defaultdict(list)
     for module in GRAPH.files:
         # A command or a study is called like the package that it works with.
-        if not module.startswith(("scripts", "snn_fusion_failure.sweeps.studies.")):
-            if module.count("."):
-                held[module.split(".")[-1]].append(module)
+        named = not module.startswith(("scripts", "snn_fusion_failure.sweeps.studies."))
+        if named and module.count("."):
+            held[module.split(".")[-1]].append(module)
     twice = {name: modules for name, modules in held.items() if len(modules) > 1}
     assert set(twice) - set(SAME_MEANING) <= KNOWN_NAMES, twice
 

@@ -43,14 +43,14 @@ def main(argv: Sequence[str] | None = None) -> None:
     Raises:
         SystemExit: 2 for an unknown command; what the command itself leaves with.
     """
-    from importlib import metadata
+    from snn_fusion_failure import __version__
 
     given = list(sys.argv[1:] if argv is None else argv)
     if not given or given[0] in ("-h", "--help", "help"):
         print(listing())
         return
     if given[0] == "--version":
-        print(metadata.version("snn-fusion-failure"))
+        print(__version__)
         return
     name = given[0].replace("_", "-")
     if name not in COMMANDS:

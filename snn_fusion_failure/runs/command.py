@@ -10,6 +10,7 @@ from snn_fusion_failure.runs.console import fail, print_result
 
 INTERRUPTED = 130
 """Exit status after Ctrl-C, as shells count it: 128 + SIGINT."""
+_KEPT = "what was finished is kept; the same command with --resume goes on where it keeps a folder"
 
 
 class WorkFailedError(RuntimeError):
@@ -29,7 +30,8 @@ def run_command(
 
     Args:
         config: dataclass, or union of dataclasses (sub-commands), that tyro parses into.
-        main: the work; raises ValueError or FileNotFoundError for bad input.
+        main: the work; raises ValueError or FileNotFoundError for bad input. A KeyboardInterrupt
+            may carry the words that say how to go on.
         description: text of `--help`.
         fields: from what `main` returns to the `result:` line; None where `main` prints it.
         argv: the arguments; those of the process when left out.
@@ -37,8 +39,8 @@ def run_command(
 
     Raises:
         SystemExit: 2 after bad input, 1 after failed or missing work (`main` returned a true
-            `failed`, or raised :class:`WorkFailedError`), 130 after Ctrl-C. A command that
-            returns has worked.
+            `failed` or `missing`, or raised :class:`WorkFailedError`), 130 after Ctrl-C. A command
+            that returns has worked.
     """
     import tyro
 
@@ -51,13 +53,9 @@ def run_command(
         print(f"error: {error}", file=sys.stderr)
         raise SystemExit(1) from error
     except KeyboardInterrupt as error:
-        print(
-            "interrupted: what was finished is kept; the same command with --resume goes on "
-            "where it keeps a run folder",
-            file=sys.stderr,
-        )
-        raise SystemExit(INTERRUPTED) from error
+        print(f"interrupted: {str(error) or _KEPT}", file=sys.stderr)
+        raise SystemExit(INTERRUPTED) from None
     if fields is not None:
         print_result(**fields(found))
-    if isinstance(found, Mapping) and found.get("failed"):
+    if isinstance(found, Mapping) and (found.get("failed") or found.get("missing")):
         raise SystemExit(1)

@@ -15,6 +15,9 @@ def open_run(
 ) -> dict[str, Any]:
     """Claim the folder `out` for a run with these settings and write its `config.json`.
 
+    A run that is gone on with keeps what its beginning was made by: each further part is a line of
+    `resumed` with its own command, commit, versions, device and date.
+
     Args:
         out: the run folder; made when it is missing.
         settings: dataclass or dict that defines the run (seeds included, output options not).
@@ -30,7 +33,8 @@ def open_run(
     wanted = to_jsonable(settings)
     config = out / "config.json"
     if config.exists() and not overwrite:
-        held = json.loads(config.read_text(encoding="utf-8"))["settings"]
+        found = json.loads(config.read_text(encoding="utf-8"))
+        held = found["settings"]
         if not resume:
             raise ValueError(
                 f"{out} already holds a run; pass --resume to go on with it, --overwrite to "
@@ -43,6 +47,9 @@ def open_run(
                 f"{out} holds a run with other settings ({changes}); resume with the same "
                 "settings or choose another --out"
             )
+        resumed = [*found.get("resumed", []), provenance()]
+        write_json(config, {**found, "resumed": resumed})
+        return wanted
     if overwrite and out.exists():
         for name in ("metrics.jsonl", "result.json"):
             (out / name).unlink(missing_ok=True)

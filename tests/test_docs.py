@@ -9,11 +9,9 @@ A Python block of a tutorial is executed, after those before it on the page. An 
 from __future__ import annotations
 
 import ast
-import importlib
-import inspect
 import re
-import shlex
-import typing
+import runpy
+import sys
 import unicodedata
 from pathlib import Path
 from typing import Any
@@ -22,7 +20,8 @@ import pytest
 import tyro
 
 from snn_fusion_failure.documentation import api as render_api
-from snn_fusion_failure.documentation.commands import (
+from snn_fusion_failure.documentation import documented
+from snn_fusion_failure.documentation.documented import (
     PAGES,
     ROOT,
     commands,
@@ -141,33 +140,49 @@ def test_commands_are_found() -> None:
     assert commands(text) == ["python scripts/a.py --x 1 --y 2 # why", "python scripts/b.py"]
 
 
-def parse(command: str) -> None:
-    """Build the configuration of the script from the options, without running it."""
-    words = shlex.split(command, comments=True)
-    words = words[words.index("python") + 1 :]
-    name, arguments = Path(words[0]).stem, words[1:]
-    module = importlib.import_module(f"scripts.{name}")
-    if name == "sweep" and arguments[:1] == ["show"]:
-        tyro.cli(module.Show, args=arguments[1:])
+class Parsed(BaseException):
+    """The options of a command are good."""
+
+
+def parse(command: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Start a script as its command would, up to the point where its options are parsed."""
+    words = documented.words(command)
+    assert (ROOT / words[0]).is_file(), f"{words[0]} is not there"
+    if len(words) == 1:
         return
-    given = list(typing.get_type_hints(module.main).items())
-    if not inspect.signature(module.main).parameters:
-        assert arguments == [], f"{name} takes no options"
+    real = tyro.cli
+
+    def parse_only(*args: Any, **kwargs: Any) -> None:
+        real(*args, **kwargs)
+        raise Parsed
+
+    monkeypatch.setattr(tyro, "cli", parse_only)
+    monkeypatch.setattr(sys, "argv", words)
+    try:
+        runpy.run_path(str(ROOT / words[0]), run_name="__main__")
+    except Parsed:
         return
-    settings = getattr(module, "Command", given[0][1])
-    tyro.cli(settings, args=arguments)
+    except SystemExit as leaving:
+        if leaving.code:
+            raise
+        return  # --help
+    finally:
+        monkeypatch.undo()
+    raise AssertionError(f"{words[0]} takes no options, and has run")
 
 
 @pytest.mark.relaxed
 @pytest.mark.parametrize(
-    "script", sorted({shlex.split(c)[shlex.split(c).index("python") + 1] for _, c in COMMANDS})
+    "script", sorted({documented.words(command)[0] for _, command in COMMANDS})
 )
-def test_commands_parse(script: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_commands_parse(
+    script: str, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
     for where, command in COMMANDS:
-        if f" {script}" not in f" {command}":
+        if documented.words(command)[0] != script:
             continue
         try:
-            parse(command)
+            parse(command, monkeypatch)
         except SystemExit:
             message = capsys.readouterr()
             pytest.fail(f"{where}: `{command}` does not parse: {message.out}{message.err}")

@@ -4,7 +4,7 @@
     python scripts/tools/check_commands.py --only train_snn reproduce
 
 The commands are those that a reader finds, with the options of the table in
-snn_fusion_failure/documentation/commands.py appended. They run in a copy of the repository in a
+snn_fusion_failure/documentation/documented.py appended. They run in a copy of the repository in a
 temporary folder, with made-up data sets and simulated KITTI frames, so that the repository and its
 results/ are not touched. Commands of one
 area share a process, as a notebook would: what is imported and compiled once serves the next. One

@@ -4,7 +4,7 @@
     python scripts/tools/check_commands.py --only train_snn reproduce
 
 The commands are those that a reader finds, with the options of the table in
-snn_fusion_failure/documentation/commands.py appended. They run in a copy of the repository in a
+snn_fusion_failure/documentation/documented.py appended. They run in a copy of the repository in a
 temporary folder, with made-up data sets and simulated KITTI frames, so that the repository and its
 results/ are not touched. Commands of one
 area share a process, as a notebook would: what is imported and compiled once serves the next. One
@@ -33,8 +33,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.documentation import commands as documented_commands
-from snn_fusion_failure.documentation import sample_data
+from snn_fusion_failure.documentation import documented, sample_data
 from snn_fusion_failure.runs import repository, write_text
 
 CHECKED = ("results", "docs", "README.md")
@@ -65,7 +64,7 @@ class Done:
     error: str = ""
 
 
-def missing(rule: documented_commands.Rule) -> str:
+def missing(rule: documented.Rule) -> str:
     """The program or package that a command needs and that is not here, in words."""
     name = rule.needs
     if not name or shutil.which(name) or importlib.util.find_spec(name):
@@ -150,7 +149,7 @@ def cpu_seconds() -> float:
 
 def work(folder: Path, numbers: Sequence[int]) -> None:
     """Run commands one after another in the copy; a JSON line for each on stdout."""
-    commands = documented_commands.documented()
+    commands = documented.documented()
     if folder != repository.ROOT:
         raise RuntimeError(f"scripts come from {repository.ROOT}, expected {folder}")
     logs = folder / "logs"
@@ -193,13 +192,13 @@ def run_area(folder: Path, numbers: Sequence[int]) -> Iterator[Done]:
         yield Done(number, 0.0, 0.0, f"its process ended with status {process.returncode}")
 
 
-def choose(config: Config) -> tuple[dict[int, documented_commands.Command], dict[int, str]]:
+def choose(config: Config) -> tuple[dict[int, documented.Command], dict[int, str]]:
     """Commands to run, and why others are not, by number.
 
     Raises:
         ValueError: the table has no rule for a command, or `only` leaves none.
     """
-    commands = dict(enumerate(documented_commands.documented()))
+    commands = dict(enumerate(documented.documented()))
     chosen = {
         n: c
         for n, c in commands.items()
@@ -210,15 +209,13 @@ def choose(config: Config) -> tuple[dict[int, documented_commands.Command], dict
     lacking = [c.text for c in chosen.values() if c.rule is None]
     if lacking:
         raise ValueError(
-            f"snn_fusion_failure/documentation/commands.py has no rule for {lacking[0]!r}"
+            f"snn_fusion_failure/documentation/documented.py has no rule for {lacking[0]!r}"
         )
     why = {n: c.rule.not_run or missing(c.rule) for n, c in chosen.items() if c.rule}
     return {n: c for n, c in chosen.items() if not why[n]}, {n: w for n, w in why.items() if w}
 
 
-def run_all(
-    config: Config, folder: Path, chosen: dict[int, documented_commands.Command]
-) -> list[Done]:
+def run_all(config: Config, folder: Path, chosen: dict[int, documented.Command]) -> list[Done]:
     """Run the chosen commands in the copy, area by area, and print a line for each."""
     (folder / "logs").mkdir(parents=True)
     copy_repository(folder)
@@ -230,7 +227,7 @@ def run_all(
             (folder / command.rule.forget).unlink(missing_ok=True)
         if command.rule and command.rule.held:
             write_text(folder / command.rule.held[0], command.rule.held[1])
-    if documented_commands.FUSION_DATA in areas:
+    if documented.FUSION_DATA in areas:
         sample_data.make_data(folder / "data")
     finished: list[Done] = []
     lock = threading.Lock()
@@ -254,7 +251,7 @@ def run_all(
     return finished
 
 
-def explain(folder: Path, done: Done, command: documented_commands.Command) -> str:
+def explain(folder: Path, done: Done, command: documented.Command) -> str:
     """What a command that failed was, and the end of what it printed."""
     lines = [f"  in {command.page}, run as: {shlex.join(command.words)}", f"  {done.error}"]
     for kind in ("out", "err"):
@@ -268,7 +265,7 @@ def explain(folder: Path, done: Done, command: documented_commands.Command) -> s
 def main(config: Config) -> dict[str, Any]:
     """Run the commands; returns how many were run, were not run, and failed."""
     chosen, why = choose(config)
-    commands = documented_commands.documented()
+    commands = documented.documented()
     for number, reason in why.items():
         print(f"not run: {commands[number].text}: {reason}")
     if config.list:

@@ -229,21 +229,24 @@ class Command:
     @property
     def words(self) -> list[str]:
         """What is run: without `python` and pinning, placeholders filled, `small` appended."""
-        words = [_filled(word) for word in _words(self.text)]
-        return words + shlex.split(self.rule.small if self.rule else "")
+        filled = [_filled(word) for word in words(self.text)]
+        return filled + shlex.split(self.rule.small if self.rule else "")
 
     @property
     def area(self) -> str:
         """Commands of one area run in one process, in the order in which they are printed."""
-        name = Path(_words(self.text)[0]).stem
+        name = Path(words(self.text)[0]).stem
         return next((area for area, scripts in AREAS.items() if name in scripts), "rest")
 
 
-def _words(text: str) -> list[str]:
-    words = [word for word in shlex.split(text, comments=True) if word != "..."]
-    if "python" in words and words[words.index("python") + 1] != "-c":
-        return words[words.index("python") + 1 :]
-    return words
+def words(text: str) -> list[str]:
+    """A command without `python`, pinning and comments; a sub-command of `sff` as its script."""
+    found = [word for word in shlex.split(text, comments=True) if word != "..."]
+    if found[0] == "sff" and len(found) > 1:
+        return [f"scripts/{found[1].replace('-', '_')}.py", *found[2:]]
+    if "python" in found and found[found.index("python") + 1] != "-c":
+        return found[found.index("python") + 1 :]
+    return found
 
 
 def _filled(word: str) -> str:
@@ -255,8 +258,8 @@ def _filled(word: str) -> str:
 
 def rule_for(text: str) -> Rule | None:
     """The first rule that has no other words than the command."""
-    words = _words(text)
-    held = {*words, words[0].removeprefix("scripts/"), " ".join(words[:2])}
+    given = words(text)
+    held = {*given, Path(given[0]).name, " ".join(given[:2])}
     for rule in RULES:
         if rule.words in held or set(rule.words.split()) <= held:
             return rule
@@ -264,7 +267,7 @@ def rule_for(text: str) -> Rule | None:
 
 
 def commands(text: str, *, abbreviated: bool = False) -> list[str]:
-    """Commands of our scripts: lines of fenced or indented blocks, and whole ones in backticks.
+    """Commands of our scripts and of `sff`: lines of blocks, and whole ones in backticks.
 
     Args:
         text: Markdown, or a docstring.
@@ -272,9 +275,13 @@ def commands(text: str, *, abbreviated: bool = False) -> list[str]:
     """
     text = re.sub(r"\\\n\s*", " ", text)
     lines = re.findall(
-        r"^(?:\s*\$ |\s*)((?:taskset -c \d+ )?python scripts/\S+\.py.*)$", text, re.MULTILINE
+        r"^(?:\s*\$ |\s*)((?:(?:taskset -c \d+ )?python scripts/\S+\.py|sff [a-z-]+).*)$",
+        text,
+        re.MULTILINE,
     )
-    inline = re.findall(r"`((?:taskset -c \d+ )?python\s+scripts/\w+\.py[^`]*)`", text)
+    inline = re.findall(
+        r"`((?:taskset -c \d+ )?(?:python\s+scripts/[\w/]+\.py|sff [a-z-]+(?= ))[^`]*)`", text
+    )
     found = [" ".join(c.split()) for c in [*(x for x in lines if "`" not in x), *inline]]
     # Brackets hold options that may be left out.
     found = [re.sub(r"\[(--[^\]]*)\]", r"\1", c) for c in found]
@@ -300,7 +307,7 @@ def script_commands() -> list[tuple[str, str]]:
     """(where, command of a script) of all pages and of the scripts' docstrings, each once."""
     found: dict[str, str] = {}
     texts = {page_name(page): page.read_text(encoding="utf-8") for page in PAGES}
-    for path in sorted((ROOT / "scripts").glob("*.py")):
+    for path in sorted((ROOT / "scripts").rglob("*.py")):
         texts[page_name(path)] = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
     for where, text in texts.items():
         for command in commands(text):
@@ -315,6 +322,6 @@ def documented() -> list[Command]:
         text = page.read_text(encoding="utf-8")
         for printed in (*commands(text, abbreviated=True), *shell_lines(text)):
             # The same words with another comment are the same command.
-            key = shlex.join(_words(printed))
+            key = shlex.join(words(printed))
             found.setdefault(key, Command(page_name(page), printed, rule_for(printed)))
     return list(found.values())

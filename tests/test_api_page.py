@@ -1,4 +1,4 @@
-"""Every public name: listed, documented, typed, and clear about what it computes."""
+"""Every public name: listed by task, documented, typed, and clear about what it computes."""
 
 from __future__ import annotations
 
@@ -7,25 +7,18 @@ import re
 
 import pytest
 
-from snn_fusion_failure.documentation import api as render_api
-from snn_fusion_failure.documentation.api import Module
+from snn_fusion_failure.documentation import api, docstrings, formulas, reading
+from snn_fusion_failure.documentation.reading import Module
 
-MODULES = [m for package in render_api.PACKAGES for m in render_api.public_modules(package)]
+ROOMS = ("jaxsnn", "fusion", "failure", "snn_fusion_failure")
+MODULES = [m for room in ROOMS for m in reading.public_modules(room)]
+NAMES = [name for package in api.PACKAGES for name in api.listed(package)]
 
 # A function that takes or gives arrays says what it computes by an equation, a shape or a source.
 # Those below take or give trees of parameters, for which the summary says all there is.
 NO_FORMULA = {
-    "fusion.detection.learning.fitting.frame_order": "indices of frames",
-    "fusion.detection.kitti.geometry_files.write_plane": "writes a file",
-    "fusion.detection.kitti.text.parse_number": "reads one number of a file",
-    "fusion.detection.learning.objective.detector_loss": "a sum of terms with docstrings of their own",
-    "fusion.detection.learning.scoring.image_scale": "one factor, named by the summary",
-    "fusion.detection.learning.training.learning_rate": "one number, named by the summary",
-    "fusion.lattice.inputs.require_width": "refuses, computes nothing",
     "fusion.models.init": "parameters of the model that the configuration names",
-    "fusion.targets.init_targets": "parameters of the lattice networks",
     "fusion.train.init_state": "parameters and optimizer state",
-    "failure.rev_argate.train_space": "maps another public function over seeds",
 }
 KEY = re.compile(r"Key\[Array, \"\"\]")
 ARRAY = re.compile(r"\b(Array|ndarray|Float|Int|Bool)\b|-> float\b")
@@ -39,44 +32,46 @@ def signature_text(node: ast.FunctionDef) -> str:
     return f"{ast.unparse(node.args)} -> {ast.unparse(node.returns) if node.returns else ''}"
 
 
-def test_enough_is_found() -> None:
-    assert sum(len(m.definitions) for m in MODULES) > 500
-    assert sum(len(functions_of(m)) for m in MODULES) > 350
+def test_the_list_is_short_enough_to_keep() -> None:
+    count = {package: len(api.listed(package)) for package in api.PACKAGES}
+    assert 90 <= sum(count.values()) <= LISTED, count
 
 
-def test_page_of_public_names_is_up_to_date() -> None:
-    render_api.main(render_api.Config(check=True))
+# About 120 names are wanted; this only ever falls.
+LISTED = 190
+
+
+def test_pages_of_public_names_are_up_to_date() -> None:
+    api.main(api.Config(check=True))
+
+
+@pytest.mark.parametrize("name", NAMES, ids=lambda n: n.path)
+def test_a_public_name_has_a_docstring(name: api.Name) -> None:
+    assert re.search(r"[.?:)]`*$", name.text), f"not a sentence: {name.text!r}"
+    assert 5 <= len(name.text) <= 320
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda m: m.name)
-def test_module_says_what_it_is_and_lists_what_it_has(module: Module) -> None:
+def test_module_says_what_it_is(module: Module) -> None:
     assert len(module.summary) > 20, "a module starts with a docstring"
     assert len(set(module.names)) == len(module.names)
-    known = {*module.definitions, *module.imported, *module.assigned}
-    siblings = {p.stem for p in module.path.parent.iterdir()}
-    missing = [n for n in module.names if n not in known and n not in siblings]
-    assert missing == [], f"{module.name}.__all__ lists what is not there"
-    assert not [n for n in module.names if n.startswith("_")]
 
 
 @pytest.mark.parametrize("module", MODULES, ids=lambda m: m.name)
 def test_docstrings_start_with_a_summary(module: Module) -> None:
     for name in filter(module.definitions.__contains__, module.names):
-        summary = render_api.summary_of(module.definitions[name])
+        summary = reading.summary_of(module.definitions[name])
         assert len(summary) >= 5, f"{name} has no docstring"
         assert re.search(r"[.?:)]`*$", summary), f"{name}: not a sentence: {summary!r}"
         assert len(summary) <= 320, f"{name}: the rest belongs below a blank line: {summary!r}"
 
 
-def functions_of(module: Module) -> dict[str, ast.FunctionDef]:
-    """The public functions that a module defines."""
-    found = {n: module.definitions[n] for n in module.names if n in module.definitions}
-    return {n: node for n, node in found.items() if isinstance(node, ast.FunctionDef)}
-
-
 @pytest.mark.parametrize("module", MODULES, ids=lambda m: m.name)
 def test_arguments_and_results_are_typed(module: Module) -> None:
-    for name, node in functions_of(module).items():
+    for name in module.names:
+        node = module.definitions.get(name)
+        if not isinstance(node, ast.FunctionDef):
+            continue
         a = node.args
         everything = [*a.posonlyargs, *a.args, *a.kwonlyargs, *filter(None, (a.vararg, a.kwarg))]
         bare = [arg.arg for arg in everything if arg.annotation is None]
@@ -98,18 +93,14 @@ def states_what_it_computes(node: ast.FunctionDef) -> bool:
     )
 
 
-@pytest.mark.parametrize("module", MODULES, ids=lambda m: m.name)
-def test_functions_of_arrays_say_what_they_compute(module: Module) -> None:
-    for name, node in functions_of(module).items():
-        if f"{module.name}.{name}" not in NO_FORMULA:
-            assert states_what_it_computes(node), f"{name}: give equation, shapes or source"
-
-
-def test_exceptions_are_needed() -> None:
-    functions = {f"{m.name}.{n}": node for m in MODULES for n, node in functions_of(m).items()}
-    assert set(NO_FORMULA) <= set(functions)
-    needless = [name for name in NO_FORMULA if states_what_it_computes(functions[name])]
-    assert needless == []
+@pytest.mark.parametrize("package", api.PACKAGES)
+def test_functions_of_arrays_say_what_they_compute(package: str) -> None:
+    silent = [
+        where
+        for where, node in api.functions(package)
+        if where not in NO_FORMULA and not states_what_it_computes(node)
+    ]
+    assert silent == [], "give equation, shapes or source"
 
 
 @pytest.mark.parametrize(
@@ -127,3 +118,38 @@ def test_the_rule_itself(code: str, good: bool) -> None:
     (node,) = ast.parse(code).body
     assert isinstance(node, ast.FunctionDef)
     assert states_what_it_computes(node) is good
+
+
+def formulas_of(node: ast.AST) -> list[tuple[str, bool]]:
+    """(formula, on a line of its own) of a docstring."""
+    text = docstrings.to_markdown(ast.get_docstring(node) or "")  # type: ignore[arg-type]
+    shown = [(f, True) for f in re.findall(r"\\\[(.*?)\\\]", text, re.DOTALL)]
+    return shown + [(f, False) for f in re.findall(r"\\\((.*?)\\\)", text, re.DOTALL)]
+
+
+@pytest.mark.parametrize("room", ROOMS[:3])
+def test_formulas_of_docstrings_can_be_shown(room: str) -> None:
+    pytest.importorskip("latex2mathml")
+    for module in reading.public_modules(room):
+        tree = ast.parse(module.path.read_text(encoding="utf-8"))
+        for node in ast.walk(tree):
+            if isinstance(node, ast.Module | ast.ClassDef | ast.FunctionDef):
+                for formula, display in formulas_of(node):
+                    formulas.to_mathml(formula, display=display)
+
+
+def test_directives_become_marked_formulas() -> None:
+    text = "A sum.\n\n.. math:: s = a\n    + b\n\nSymbols: :math:`a` is an :func:`fusion.x.f`."
+    shown = docstrings.to_markdown(text)
+    assert "\\[s = a\n+ b\\]" in shown and "\\(a\\) is an `f`" in shown
+    text = ".. math::\n    x = 1\n\n    y = 2\n\nand more"
+    assert docstrings.to_markdown(text).strip().startswith("\\[x = 1\ny = 2\\]")
+
+
+def test_formulas_need_no_script() -> None:
+    pytest.importorskip("latex2mathml")
+    page = '<p>Of <span class="arithmatex">\\(a &lt; b\\)</span></p>'
+    made = formulas.convert_page(page)
+    assert 'alttext="a &lt; b"' in made and "<mo>&#x0003C;</mo>" in made
+    with pytest.raises(ValueError, match=r"nosuch is not known; use another command"):
+        formulas.to_mathml(r"\nosuch", display=False)

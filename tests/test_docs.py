@@ -19,8 +19,7 @@ from typing import Any
 import pytest
 import tyro
 
-from snn_fusion_failure.documentation import api as render_api
-from snn_fusion_failure.documentation import documented
+from snn_fusion_failure.documentation import documented, imports, reading
 from snn_fusion_failure.documentation.documented import (
     PAGES,
     ROOT,
@@ -71,22 +70,20 @@ def _missing(node: ast.ImportFrom | ast.Import) -> list[str]:
     )
     missing = []
     for module, name in wanted:
-        if module.split(".")[0] not in render_api.PACKAGES:
+        if module.split(".")[0] not in imports.ROOMS:
             continue
-        base = ROOT.joinpath(*module.split("."))
-        path = base / "__init__.py" if base.is_dir() else base.with_suffix(".py")
-        read = render_api.read_module(path) if path.exists() else None
-        if read is None:
+        path = reading.find_file(module)
+        if path is None:
             missing.append(module)
-        elif name is not None and name not in read.names:
-            submodule = base.is_dir() and ((base / f"{name}.py").exists() or (base / name).is_dir())
-            if not submodule:
+        elif name is not None and reading.find_file(f"{module}.{name}") is None:
+            read = reading.read_module(path)
+            if name not in {*read.names, *read.definitions, *read.imported, *read.constants}:
                 missing.append(f"{module}.{name}")
     return missing
 
 
 @pytest.mark.parametrize("page", PAGES, ids=page_name)
-def test_examples_import_public_names(page: Path) -> None:
+def test_examples_import_what_is_there(page: Path) -> None:
     for _, code, line in blocks(page):
         for node in ast.walk(ast.parse(code)):
             if isinstance(node, ast.ImportFrom | ast.Import):

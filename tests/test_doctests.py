@@ -10,7 +10,7 @@ from pathlib import Path
 
 import pytest
 
-from snn_fusion_failure.documentation import api as render_api
+from snn_fusion_failure.documentation import reading
 
 PARSER = doctest.DocTestParser()
 
@@ -31,8 +31,8 @@ def examples(path: Path) -> Iterator[tuple[str, str, int]]:
 
 MODULES = {
     module.name: found
-    for package in render_api.PACKAGES
-    for module in render_api.public_modules(package)
+    for package in ("jaxsnn", "fusion", "failure", "snn_fusion_failure")
+    for module in reading.public_modules(package)
     if (found := list(examples(module.path)))
 }
 

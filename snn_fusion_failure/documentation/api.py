@@ -1,179 +1,263 @@
-"""Write `docs/api.md`, the list of public names, from `__all__` and the docstrings.
+"""The public names: what the `__all__` of the packages lists, grouped by task.
 
-    python scripts/tools/render_api.py            # write the page
-    python scripts/tools/render_api.py --check    # only say whether it is up to date
+    python scripts/tools/render_api.py            # write docs/api.md and docs/reference/
+    python scripts/tools/render_api.py --check    # only say whether they are up to date
 
-The packages are read, not imported, so this takes a second. The test suite fails when the page is
-out of date.
+The packages are read, not imported, so this takes a second. The test suite fails when a page is
+out of date. mkdocstrings fills the pages of docs/reference/ from the docstrings.
 """
 
 from __future__ import annotations
 
 import ast
 import dataclasses
-import re
 from collections.abc import Iterator
-from pathlib import Path
 
+from snn_fusion_failure.documentation import docstrings
+from snn_fusion_failure.documentation.reading import (
+    Definition,
+    find_file,
+    one_line,
+    read_module,
+    signature,
+    summary_of,
+)
 from snn_fusion_failure.runs import repository, write_text
 
 PACKAGES = {
     "jaxsnn": "Spiking robots",
-    "fusion": "Sensor fusion and lattices",
+    "fusion": "Sensor fusion",
+    "fusion.lattice": "Lattices",
+    "fusion.detection": "Detection on KITTI",
     "failure": "Rare failures",
+    "snn_fusion_failure.sweeps": "Sweeps",
+    "snn_fusion_failure.runs": "Runs",
+    "snn_fusion_failure.records": "Records",
 }
-Definition = ast.FunctionDef | ast.ClassDef
+"""Package whose `__all__` is public -> what it is about."""
+
+TASKS = {
+    "jaxsnn.neurons": "Neurons, synapses and spikes",
+    "jaxsnn.plasticity": "Neurons, synapses and spikes",
+    "jaxsnn.window": "Neurons, synapses and spikes",
+    "jaxsnn.encoding": "Neurons, synapses and spikes",
+    "jaxsnn.running_mean": "Neurons, synapses and spikes",
+    "jaxsnn.config": "Networks that steer",
+    "jaxsnn.network": "Networks that steer",
+    "jaxsnn.presets": "Networks that steer",
+    "jaxsnn.rewards": "Networks that steer",
+    "jaxsnn.agents": "Networks that steer",
+    "jaxsnn.geometry": "The robot's world",
+    "jaxsnn.world": "The robot's world",
+    "jaxsnn.scenarios": "The robot's world",
+    "jaxsnn.maps": "The robot's world",
+    "jaxsnn.planner": "The robot's world",
+    "jaxsnn.navigation": "The robot's world",
+    "jaxsnn.trials": "Trials and experiments",
+    "jaxsnn.experiment": "Trials and experiments",
+    "jaxsnn.qlearning": "Trials and experiments",
+    "jaxsnn.ppo": "Trials and experiments",
+    "fusion.data": "Data",
+    "fusion.failures": "Sensor failures",
+    "fusion.corruption": "Sensor failures",
+    "fusion.models": "Models",
+    "fusion.encoders": "Models",
+    "fusion.gating": "Models",
+    "fusion.presets": "Models",
+    "fusion.losses": "Training and evaluation",
+    "fusion.train": "Training and evaluation",
+    "fusion.loop": "Training and evaluation",
+    "fusion.evaluate": "Training and evaluation",
+    "fusion.lattice": "Layers",
+    "fusion.detection.kitti": "Files of KITTI and average precision",
+    "fusion.detection.geometry": "Boxes and maps",
+    "fusion.detection.network": "The detector",
+    "fusion.detection.learning": "The detector",
+    "fusion.detection.config": "The detector",
+    "fusion.detection.presets": "The detector",
+    "failure.circuits": "Circuits and simulators",
+    "failure.simulators": "Circuits and simulators",
+    "failure.search": "Search",
+    "failure.models": "Models of a search",
+    "failure.revnet": "Models of a search",
+    "failure.bnn": "Models of a search",
+    "failure.rev_argate": "Models of a search",
+    "failure.rare_events": "How likely is a failure",
+    "failure.design_points": "How likely is a failure",
+    "failure.active": "How likely is a failure",
+}
+"""Where a name is defined (the longest prefix counts) -> the task that it is listed under."""
 
 HEAD = """\
 # Public names
 
-Written by `python scripts/tools/render_api.py` from `__all__` and the docstrings; the tests check
-that it is up to date, and that each function below is typed and says what it computes.
+Read off the `__all__` of the packages by `python scripts/tools/render_api.py`; a name leads to its
+docstring. Tests check that the list is up to date and that each function on it is typed, says what
+it computes, can be traced and batched.
 
 **What is stable.** A name on this page keeps its meaning and its arguments within a minor version
-(0.1.x); what changes between minor versions stands in `CHANGELOG.md`. Everything else (names with a
-leading underscore, modules with one, `scripts`, `tests`) may change at any time.
+(0.1.x); what changes between minor versions stands in `CHANGELOG.md`. Everything else may change at
+any time: names in modules that are not listed, names with a leading underscore, `scripts`, `tests`.
 `fusion.detection` is younger than the rest: its names may still move; the changelog will say so.
 
 **What holds for all of them.** No function keeps state between calls or changes a setting of jax.
 Functions of arrays are pure: they can be jitted, vmapped, differentiated where that is defined, and
-used inside `lax.scan`. `Params` are floats that may be traced and vmapped; a `Config` is a frozen
-dataclass and static under `jit`. The circuit solver and the Gaussian process work in float64 and
-expect `with jax.enable_x64(True):` around calls from your own code; their host functions
-(`simulate`, `ask`, `run`) set it themselves. `import jaxsnn, fusion, failure` prints nothing and
-leaves brax, matplotlib, orbax and xarray alone until they are needed.
+used inside `lax.scan`. Arguments come as `config, params, state, inputs`, then `key` by name;
+`init(key, config)` starts with the key. A `Config` is a frozen dataclass and static under `jit`,
+`Params` are floats that may be traced and vmapped, a `State` is what a step changes. The circuit
+solver and the Gaussian process work in float64 and expect `with jax.enable_x64(True):` around calls
+from your own code; their host functions (`simulate`, `ask`, `run`) set it themselves.
+`import jaxsnn, fusion, failure` prints nothing and leaves brax, matplotlib, orbax and xarray alone
+until they are needed.
 """
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
-    """Write the page of public names."""
+    """Write the pages of public names."""
 
     check: bool = False
-    """Do not write; exit with 1 when the page is out of date."""
+    """Do not write; exit with 2 when a page is out of date."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Module:
-    """A public module: its names, and the definitions of those that it defines itself."""
+class Name:
+    """A public name.
 
+    Attributes:
+        package: whose `__all__` lists it.
+        name: as listed.
+        home: the module that defines it, or the module itself.
+        node: definition of a function or a class; None for a module or a constant.
+        kind: function, class, module or constant.
+        text: first paragraph of its docstring.
+    """
+
+    package: str
     name: str
-    path: Path
-    summary: str
-    names: tuple[str, ...]
-    definitions: dict[str, Definition]
-    imported: frozenset[str]
-    assigned: frozenset[str]
+    home: str
+    node: Definition | None
+    kind: str
+    text: str
+
+    @property
+    def path(self) -> str:
+        """The dotted name by which it is imported."""
+        return f"{self.package}.{self.name}"
+
+    @property
+    def task(self) -> str:
+        """The heading that it stands under."""
+        found = [p for p in TASKS if f"{self.home}.".startswith(f"{p}.")]
+        return TASKS[max(found, key=len)] if found else PACKAGES[self.package]
 
 
-def summary_of(node: ast.AST) -> str:
-    """The first paragraph of a docstring on one line, or ''."""
-    text = ast.get_docstring(node) or ""  # type: ignore[arg-type]
-    return " ".join(text.split("\n\n")[0].split())
+def resolve(package: str, name: str) -> Name:
+    """Follow imports from a package to where a name is defined.
+
+    Raises:
+        ValueError: it is not there.
+    """
+    module, wanted = package, name
+    while True:
+        if (path := find_file(f"{module}.{wanted}")) is not None:
+            return Name(
+                package, name, f"{module}.{wanted}", None, "module", read_module(path).summary
+            )
+        path = find_file(module)
+        held = read_module(path) if path else None
+        if held is not None and wanted in held.definitions:
+            node = held.definitions[wanted]
+            kind = "class" if isinstance(node, ast.ClassDef) else "function"
+            return Name(package, name, module, node, kind, summary_of(node))
+        if held is not None and wanted in held.constants:
+            text = one_line(held.constants[wanted])
+            return Name(package, name, module, None, "constant", text)
+        if held is None or wanted not in held.imported:
+            raise ValueError(f"{package}.{name} is listed in `__all__`, but not in {module}")
+        module, inner = held.imported[wanted]
+        wanted = inner or wanted
 
 
-def read_module(path: Path) -> Module | None:
-    """The public names of a module, read without importing it; None when it has no `__all__`."""
-    tree = ast.parse(path.read_text(encoding="utf-8"))
-    names: tuple[str, ...] | None = None
-    definitions: dict[str, Definition] = {}
-    imported, assigned = set(), set()
-    for node in tree.body:
-        if isinstance(node, Definition):
-            definitions[node.name] = node
-        elif isinstance(node, ast.ImportFrom | ast.Import):
-            imported |= {(alias.asname or alias.name) for alias in node.names}
-        elif isinstance(node, ast.Assign | ast.AnnAssign):
-            targets = node.targets if isinstance(node, ast.Assign) else [node.target]
-            for target in targets:
-                found = {n.id for n in ast.walk(target) if isinstance(n, ast.Name)}
-                assigned |= found
-                if "__all__" in found and node.value is not None:
-                    names = tuple(ast.literal_eval(node.value))
-    if names is None:
-        return None
-    parts = path.relative_to(repository.ROOT).with_suffix("").parts
-    dotted = ".".join(parts[:-1] if parts[-1] == "__init__" else parts)
-    return Module(
-        dotted, path, summary_of(tree), names, definitions, frozenset(imported), frozenset(assigned)
-    )
+def listed(package: str) -> list[Name]:
+    """The public names of a package, in alphabetical order.
+
+    Raises:
+        ValueError: the package lists what it does not have.
+    """
+    path = find_file(package)
+    if path is None or not read_module(path).names:
+        return []
+    return [resolve(package, name) for name in sorted(read_module(path).names)]
 
 
-def public_modules(package: str) -> Iterator[Module]:
-    """The modules of a package whose path has no leading underscore, in alphabetical order."""
-    for path in sorted((repository.ROOT / package).rglob("*.py")):
-        parts = path.relative_to(repository.ROOT).with_suffix("").parts
-        if any(part.startswith("_") and part != "__init__" for part in parts):
-            continue
-        module = read_module(path)
-        if module is None:
-            raise ValueError(f"{path} has no `__all__`; list its public names there")
-        yield module
-
-
-def signature(node: Definition) -> str:
-    """Names of the arguments, `=` after those that have a default."""
-    if isinstance(node, ast.ClassDef):
-        return node.name
-    a = node.args
-    positional = [*a.posonlyargs, *a.args]
-    words = [arg.arg for arg in positional]
-    for index in range(len(positional) - len(a.defaults), len(positional)):
-        words[index] += "="
-    if a.vararg:
-        words.append(f"*{a.vararg.arg}")
-    elif a.kwonlyargs:
-        words.append("*")
-    words += [
-        arg.arg + ("=" if default is not None else "")
-        for arg, default in zip(a.kwonlyargs, a.kw_defaults, strict=True)
-    ]
-    if a.kwarg:
-        words.append(f"**{a.kwarg.arg}")
-    return f"{node.name}({', '.join(words)})"
+def functions(package: str) -> Iterator[tuple[str, ast.FunctionDef]]:
+    """(where it is defined, definition) of the public functions, those of listed modules too."""
+    for name in listed(package):
+        if isinstance(name.node, ast.FunctionDef):
+            yield f"{name.home}.{name.node.name}", name.node
+        elif name.kind == "module" and (path := find_file(name.home)) is not None:
+            module = read_module(path)
+            for inner in module.names:
+                node = module.definitions.get(inner)
+                if isinstance(node, ast.FunctionDef):
+                    yield f"{module.name}.{inner}", node
 
 
 def _cell(text: str) -> str:
-    """Text that survives in a table cell: no role marks, no column marks, one kind of code mark."""
-    text = re.sub(r":(?:func|class|mod|meth):`~?([^`]*)`", r"`\1`", text)
-    text = re.sub(r":math:`([^`]*)`", r"\\(\1\\)", text)
-    return text.replace("``", "`").replace("|", "\\|")
+    """Text that survives in a table cell."""
+    return docstrings.to_markdown(text).replace("|", "\\|")
 
 
-def render_module(module: Module) -> list[str]:
-    """Heading, summary and table of one module."""
-    lines = ["", f"### `{module.name}`", "", _cell(module.summary)]
-    own = [name for name in module.names if name in module.definitions]
-    if own:
-        lines += ["", "| name | what it is |", "|---|---|"]
-        for name in own:
-            node = module.definitions[name]
-            lines.append(f"| `{signature(node)}` | {_cell(summary_of(node))} |")
-    constants = [name for name in module.names if name in module.assigned]
-    if constants:
-        lines += ["", "Constants and types: " + ", ".join(f"`{name}`" for name in constants) + "."]
-    others = [n for n in module.names if n not in module.definitions and n in module.imported]
-    if others:
-        lines += ["", "From its modules: " + ", ".join(f"`{name}`" for name in others) + "."]
-    return lines
+def page_of(package: str) -> str:
+    """File name of a package's reference page."""
+    return f"reference/{package.split('.')[-1]}.md"
 
 
-def render() -> str:
-    """The whole page."""
+def _by_task(names: list[Name]) -> dict[str, list[Name]]:
+    order = list(dict.fromkeys(TASKS.values()))
+    held: dict[str, list[Name]] = {}
+    for name in sorted(names, key=lambda n: order.index(n.task) if n.task in order else len(order)):
+        held.setdefault(name.task, []).append(name)
+    return held
+
+
+def _package_pages(package: str) -> tuple[list[str], list[str]]:
+    """Lines of the list and of the reference page."""
+    title = f"{PACKAGES[package]}: `{package}`"
+    lines = ["", f"## {title}"]
+    reference = [f"# {title}", "", "Back to the [list of public names](../api.md)."]
+    for task, group in _by_task(listed(package)).items():
+        lines += ["", f"### {task}", "", "| name | what it is |", "|---|---|"]
+        reference += ["", f"## {task}"]
+        for name in group:
+            shown = signature(name.node) if name.node else name.name
+            link = f"[`{shown}`]({page_of(package)}#{name.path})"
+            lines.append(f"| {link} | {_cell(name.text)} |")
+            target = name.home if name.kind == "module" else f"{name.home}.{name.name}"
+            reference += ["", f'<a id="{name.path}"></a>', "", f"::: {target}"]
+    return lines, reference
+
+
+def render() -> dict[str, str]:
+    """Path below docs/ -> text of each page."""
     lines = [HEAD.rstrip()]
-    for package, title in PACKAGES.items():
-        lines += ["", f"## {title}: `{package}`"]
-        for module in public_modules(package):
-            lines += render_module(module)
-    return "\n".join(lines) + "\n"
+    pages = {}
+    for package in filter(listed, PACKAGES):
+        more, reference = _package_pages(package)
+        lines += more
+        pages[page_of(package)] = "\n".join(reference) + "\n"
+    return {"api.md": "\n".join(lines) + "\n", **pages}
 
 
 def main(config: Config) -> dict[str, int]:
-    """Write or check the page; returns how many names it lists."""
-    path = repository.ROOT / "docs" / "api.md"
-    text = render()
-    if config.check and (not path.exists() or path.read_text(encoding="utf-8") != text):
-        raise ValueError(f"{path} is out of date: run `python scripts/tools/render_api.py`")
-    if not config.check:
-        write_text(path, text)
-    return {"names": text.count("\n| `"), "modules": text.count("\n### ")}
+    """Write or check the pages; returns how many names they list."""
+    docs = repository.ROOT / "docs"
+    pages = render()
+    for name, text in pages.items():
+        path = docs / name
+        if config.check and (not path.exists() or path.read_text(encoding="utf-8") != text):
+            raise ValueError(f"{path} is out of date: run `python scripts/tools/render_api.py`")
+        if not config.check:
+            write_text(path, text)
+    return {"names": sum(len(listed(p)) for p in PACKAGES), "pages": len(pages)}

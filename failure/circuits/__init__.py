@@ -4,9 +4,8 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
-from failure.circuits.buck.converter import make_dcdc
-from failure.circuits.buck.light_load import make_dcdc_light
-from failure.circuits.ldo.regulator import make_ldo
+from failure.circuits.buck.circuit import make_dcdc, make_dcdc_light
+from failure.circuits.ldo.circuit import make_ldo
 from failure.circuits.protocol import Circuit, Spec
 
 __all__ = ["CIRCUITS", "Circuit", "Spec", "get", "make_dcdc", "make_dcdc_light", "make_ldo"]
@@ -30,5 +29,5 @@ def get(name: str) -> Circuit:
         ValueError: unknown name.
     """
     if name not in CIRCUITS:
-        raise ValueError(f"unknown circuit {name!r}; known: {', '.join(CIRCUITS)}")
+        raise ValueError(f"circuit={name!r}: expected one of {', '.join(map(repr, CIRCUITS))}")
     return CIRCUITS[name]()

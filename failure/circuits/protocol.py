@@ -32,7 +32,7 @@ class Circuit:
     """A circuit under parameter variation.
 
     `simulate(x)` maps `x [n, d]`, in units of sigma, to `(specs [n, m] float64, status [n] int)`;
-    status 0 is a converged sample, anything else is neither a pass nor a failure. It computes in
+    status is a `failure.Status`; anything but 0 is neither a pass nor a failure. It computes in
     float64 whatever the caller's setting, and may be jitted, mapped and differentiated inside
     `jax.enable_x64(True)`.
     """
@@ -84,8 +84,8 @@ class Circuit:
         """
         if name not in self.spec_names:
             raise ValueError(
-                f"unknown specification {name!r} of circuit {self.name!r}; known: "
-                f"{', '.join(self.spec_names)}"
+                f"spec={name!r}: expected a specification of {self.name!r}, one of "
+                f"{', '.join(map(repr, self.spec_names))}"
             )
         return self.spec_names.index(name)
 
@@ -101,7 +101,8 @@ class Circuit:
         """
         if x.ndim != 2 or x.shape[1] != self.n_dims:
             raise ValueError(
-                f"circuit {self.name!r} takes x of shape [n, {self.n_dims}], got {x.shape}"
+                f"x of shape {tuple(x.shape)}: expected [n, {self.n_dims}], one row per sample of "
+                f"{self.name!r}"
             )
         with jax.enable_x64(True):
             out: tuple[Array, Array] = self._jit(jnp.asarray(x, jnp.float64))

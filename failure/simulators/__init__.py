@@ -1,3 +1,6 @@
-"""A user's own simulator behind one protocol: parallel, timed, retried, and never paid twice."""
+"""A user's own simulator: a function, a program, or a netlist."""
 
-__all__: list[str] = []
+from failure.simulators.processes import SimulatorError
+from failure.simulators.wrappers import CommandSimulator, FunctionSimulator, Simulator
+
+__all__ = ["CommandSimulator", "FunctionSimulator", "Simulator", "SimulatorError"]

@@ -3,7 +3,7 @@
 `simulate(x [n, d]) -> (specs [n, m], status [n])`. Wrap a Python function with `FunctionSimulator`
 or a program with `CommandSimulator`; both run samples in parallel worker processes, end a sample
 that exceeds its time limit, try again, and write every finished sample to a cache on disk before
-the next one starts. Status: 0 good, 1 failed, 2 out of time, 3 not finite.
+the next one starts. The status of a sample is a `failure.Status`.
 """
 
 from __future__ import annotations
@@ -12,8 +12,6 @@ import hashlib
 import json
 import multiprocessing
 import os
-import signal
-import subprocess
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -21,27 +19,11 @@ from typing import Any, Protocol
 
 import numpy as np
 
-from failure.simulators.batches import (
-    FAILED,
-    GOOD,
-    NOT_FINITE,
-    STATUS,
-    TIMED_OUT,
-    Batch,
-    Cache,
-)
+from failure.simulators.batches import Batch
+from failure.simulators.processes import Group, SimulatorError, end_group
+from failure.status import Status
 
-__all__ = [
-    "FAILED",
-    "GOOD",
-    "NOT_FINITE",
-    "STATUS",
-    "TIMED_OUT",
-    "Cache",
-    "CommandSimulator",
-    "FunctionSimulator",
-    "Simulator",
-]
+__all__ = ["CommandSimulator", "FunctionSimulator", "Simulator"]
 
 
 class Simulator(Protocol):
@@ -53,6 +35,9 @@ class Simulator(Protocol):
 
 def _serve(function: Callable[[np.ndarray], Any], pipe: Any) -> None:
     """Loop of a worker process: a row in, a result out; the first message says it is ready."""
+    # A group of its own: Ctrl-C is the parent's, and what the function starts ends with it.
+    if hasattr(os, "setsid"):
+        os.setsid()
     pipe.send("ready")
     while True:
         try:
@@ -60,9 +45,9 @@ def _serve(function: Callable[[np.ndarray], Any], pipe: Any) -> None:
         except EOFError:
             return
         try:
-            pipe.send((np.asarray(function(row), np.float64), GOOD, ""))
+            pipe.send((np.asarray(function(row), np.float64), int(Status.GOOD), ""))
         except Exception as error:
-            pipe.send((None, FAILED, f"{type(error).__name__}: {error}"))
+            pipe.send((None, int(Status.FAILED), f"{type(error).__name__}: {error}"))
 
 
 _START_LIMIT = 300.0
@@ -72,8 +57,9 @@ _START_LIMIT = 300.0
 class _Process:
     """One worker process, started again after it had to be ended."""
 
-    def __init__(self, function: Callable[[np.ndarray], Any]) -> None:
+    def __init__(self, function: Callable[[np.ndarray], Any], group: Group) -> None:
         self._function = function
+        self._group = group
         self._process: Any = None
 
     def __enter__(self) -> _Process:
@@ -96,32 +82,35 @@ class _Process:
             ready = False
         if not ready:
             self._stop()
-            raise ValueError(
-                f"no worker process for {self._function!r}: it must be a top-level function of a "
-                "module that a new process can import"
+            raise SimulatorError(
+                f"function={self._function!r}: expected a top-level function of a module that a "
+                "new process can import"
             )
+        self._group.adopt(self._process.pid)
 
     def _stop(self) -> None:
         if self._process is not None:
             self._pipe.close()
+            end_group(self._process.pid)
             self._process.kill()
             self._process.join()
+            self._group.forget(self._process.pid)
             self._process.close()
             self._process = None
 
     def __call__(self, row: np.ndarray, timeout: float) -> tuple[Any, int, str]:
         if self._process is None:
             self._start()
-        self._pipe.send(row)
         try:
+            self._pipe.send(row)
             if self._pipe.poll(timeout):
                 result: tuple[Any, int, str] = self._pipe.recv()
                 return result
-        except EOFError:
+        except (EOFError, OSError):
             self._stop()
-            return None, FAILED, "the worker process ended"
+            return None, Status.FAILED, "the worker process ended"
         self._stop()
-        return None, TIMED_OUT, f"no result after {timeout} s"
+        return None, Status.TIMED_OUT, f"no result after {timeout} s"
 
 
 @dataclass
@@ -134,6 +123,7 @@ class FunctionSimulator:
 
     Raises:
         ValueError: settings out of range.
+        SimulatorError: the function cannot be imported, or never works.
     """
 
     function: Callable[[np.ndarray], Any]
@@ -159,7 +149,7 @@ class FunctionSimulator:
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`x [n, d] -> (specs [n, m], status [n])`; `messages` then tells of each bad row."""
-        return self._batch.run(x, lambda: _Process(self.function))
+        return self._batch.run(x, lambda group: _Process(self.function, group))
 
     @property
     def messages(self) -> Mapping[int, str]:
@@ -175,8 +165,9 @@ class FunctionSimulator:
 class _Command:
     """One attempt is one process of the user's program."""
 
-    def __init__(self, argv: tuple[str, ...]) -> None:
+    def __init__(self, argv: tuple[str, ...], group: Group) -> None:
         self._argv = argv
+        self._group = group
 
     def __enter__(self) -> _Command:
         return self
@@ -185,33 +176,18 @@ class _Command:
         pass
 
     def __call__(self, row: np.ndarray, timeout: float) -> tuple[Any, int, str]:
+        done = self._group.run(self._argv, timeout=timeout, stdin=json.dumps(row.tolist()) + "\n")
+        if done.returncode is None:
+            return None, Status.TIMED_OUT, f"no result after {timeout} s"
+        if done.returncode != 0:
+            problem = f"exit status {done.returncode}: {done.stderr.strip()[-300:]}"
+            return None, Status.FAILED, problem
+        lines = done.stdout.strip().splitlines()
         try:
-            process = subprocess.Popen(
-                self._argv,
-                stdin=subprocess.PIPE,
-                stdout=subprocess.PIPE,
-                stderr=subprocess.PIPE,
-                text=True,
-                start_new_session=True,
-            )
-        except OSError as error:
-            raise ValueError(
-                f"cannot start {self._argv[0]!r}: {error}; give the full path of the simulator"
-            ) from error
-        try:
-            out, err = process.communicate(json.dumps(row.tolist()) + "\n", timeout)
-        except subprocess.TimeoutExpired:
-            # Its own session: children that the program has started go with it.
-            os.killpg(process.pid, signal.SIGKILL)
-            process.communicate()
-            return None, TIMED_OUT, f"no result after {timeout} s"
-        if process.returncode != 0:
-            return None, FAILED, f"exit status {process.returncode}: {err.strip()[-300:]}"
-        lines = out.strip().splitlines()
-        try:
-            return json.loads(lines[-1].replace("nan", "NaN")), GOOD, ""
+            return json.loads(lines[-1].replace("nan", "NaN")), Status.GOOD, ""
         except (IndexError, ValueError):
-            return None, FAILED, f"last line of the output is no JSON list: {lines[-1:]}"
+            problem = f"last line of the output is no JSON list: {lines[-1:]}"
+            return None, Status.FAILED, problem
 
 
 @dataclass
@@ -222,7 +198,8 @@ class CommandSimulator:
     the command, `version`, and the content of the files in `depends` (netlists, model cards).
 
     Raises:
-        ValueError: settings out of range, or the program cannot be started.
+        ValueError: settings out of range.
+        SimulatorError: the program cannot be started, or never works.
     """
 
     argv: Sequence[str]
@@ -253,7 +230,7 @@ class CommandSimulator:
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """`x [n, d] -> (specs [n, m], status [n])`; `messages` then tells of each bad row."""
         argv = tuple(self.argv)
-        return self._batch.run(x, lambda: _Command(argv))
+        return self._batch.run(x, lambda group: _Command(argv, group))
 
     @property
     def messages(self) -> Mapping[int, str]:

@@ -45,8 +45,8 @@ def main(config: Config) -> dict[str, Any]:
     import jax
     import numpy as np
 
+    from failure.circuits.ldo.circuit import make_ldo
     from failure.circuits.ldo.reference import ldo_decks
-    from failure.circuits.ldo.regulator import make_ldo
     from failure.circuits.solver import ngspice
 
     ngspice.require()

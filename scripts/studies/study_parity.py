@@ -89,7 +89,7 @@ def ldo_ngspice(config: Config) -> dict[str, Any]:
     """LDO regulator against ngspice."""
     import numpy as np
 
-    from failure.circuits.ldo.regulator import make_ldo
+    from failure.circuits.ldo.circuit import make_ldo
 
     x = np.random.default_rng(config.seed).normal(size=(config.ldo_samples, 60))
     result: dict[str, Any] = {"samples": len(x)}
@@ -160,7 +160,7 @@ def dcdc_ngspice(config: Config) -> dict[str, Any]:
     """DC-DC converter against every transistor switching in every period."""
     import numpy as np
 
-    from failure.circuits.buck.converter import make_dcdc
+    from failure.circuits.buck.circuit import make_dcdc
 
     x = np.random.default_rng(config.seed).normal(size=(config.dcdc_samples, 44))
     result: dict[str, Any] = {"samples": len(x), "max_step": config.max_step}

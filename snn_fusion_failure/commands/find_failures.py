@@ -2,24 +2,25 @@
 
     python scripts/find_failures.py --circuit ldo --spec undershoot --seeds 20 --out DIR
 
-Runs `seeds` searches side by side (50 initial and 250 sequential simulations each), shows progress
-and the worst case so far, and writes to DIR: `evaluations.jsonl` (every simulation, as it comes),
-`result.json`, `failures.csv`, `trend.png`, `worst.png`. A run that was killed goes on with
-`--resume`; no simulation is repeated. Without `--threshold` it is set at 90 % of the way from the
-nominal value to the worst one that gradient ascents find.
+Runs `seeds` searches side by side (`--preset paper`: 50 initial and 250 further simulations each;
+`quick`: 10 and 20), shows progress and the worst case so far, and writes to DIR:
+`evaluations.jsonl` (every simulation, as it comes), `result.json`, `failures.csv`, `trend.png`,
+`worst.png`. A run that was killed goes on with `--resume`; no simulation is repeated. Without
+`--threshold` it is set at 90 % of the way from the nominal value to the worst one that gradient
+ascents find. `--set search.refit_every=4` changes a constant of the search.
 
 One seed takes 10 to 30 CPU-seconds beside the simulations, the first run 30 more to compile.
 """
 
 from __future__ import annotations
 
-import csv
 import dataclasses
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.runs import (
+    apply_changes,
     enable_compilation_cache,
     open_run,
     print_result,
@@ -48,10 +49,14 @@ class Config:
     """Searches side by side."""
     first_seed: int = 0
     """Seed of the first one."""
-    n_init: int = 50
-    """Initial simulations."""
-    n_total: int = 300
-    """Simulations in all."""
+    preset: str = "paper"
+    """quick (10 initial of 30 simulations) or paper (50 of 300)."""
+    n_init: int | None = None
+    """Initial simulations, instead of the preset's."""
+    n_total: int | None = None
+    """Simulations in all, instead of the preset's."""
+    set: tuple[str, ...] = ()
+    """Constants of the search to change: search.NAME=VALUE."""
     embedding_dim: int | None = None
     """Search dimensions of HDBO and Rev-ARGate; 22 of 60 and its share elsewhere without."""
     threshold: float | None = None
@@ -66,43 +71,37 @@ class Config:
     """Forget the run in `out`."""
 
 
-def describe_points(circuit: Any, x: Any) -> str:
-    """One failure point as a table: a row per transistor, a column per quantity, in sigma."""
-    quantities = list(dict.fromkeys(q for _, q in circuit.parameter_names))
-    transistors = list(dict.fromkeys(t for t, _ in circuit.parameter_names))
-    values = dict(zip(circuit.parameter_names, x, strict=True))
-    lines = ["transistor  " + "  ".join(f"{q:>10}" for q in quantities)]
-    for name in transistors:
-        cells = (values.get((name, q)) for q in quantities)
-        lines.append(
-            f"{name:<10}  "
-            + "  ".join(f"{c:>+10.2f}" if c is not None else " " * 10 for c in cells)
-        )
-    return "\n".join(lines)
+BUDGETS = {"quick": (10, 30), "paper": (50, 300)}
+"""Preset -> initial simulations, simulations in all."""
 
 
-def threshold_for(circuit: Any, column: int, task: Any, out: Path) -> float:
-    """The threshold of this task, computed once per folder."""
-    import json
+def search_of(config: Config, task: Any) -> Any:
+    """The search that the options ask for."""
+    from failure.search.bayesopt import SearchConfig
 
-    from failure.search.thresholds import reachable
-
-    path = out / "threshold.json"
-    if path.exists():
-        return float(json.loads(path.read_text(encoding="utf-8"))["threshold"])
-    reach = reachable(circuit.run, column, task, sense=circuit.specs[column].sense)
-    write_json(path, reach._asdict())
-    return reach.threshold
+    if config.preset not in BUDGETS:
+        raise ValueError(f"preset={config.preset!r}: expected one of {', '.join(BUDGETS)}")
+    n_init, n_total = BUDGETS[config.preset]
+    search = SearchConfig(
+        task,
+        config.method,
+        seeds=tuple(range(config.first_seed, config.first_seed + config.seeds)),
+        n_init=n_init if config.n_init is None else config.n_init,
+        n_total=n_total if config.n_total is None else config.n_total,
+        embedding_dim=config.embedding_dim,
+    )
+    return apply_changes({"search": search}, config.set)["search"]
 
 
 def main(config: Config) -> dict[str, Any]:
     """Run the searches; returns the result that is also written."""
     import numpy as np
 
-    from failure import circuits, plots
-    from failure.search.bayesopt import METHODS, SearchConfig, SearchState, best_so_far, first_hit
+    from failure import circuits
+    from failure.search.bayesopt import METHODS, SearchState, best_so_far, first_hit
     from failure.search.runs import run
     from failure.search.spaces import Task
+    from snn_fusion_failure.records import failure_runs
 
     if config.verify not in (None, "ngspice"):
         raise ValueError(f"verify={config.verify!r}: expected 'ngspice' or nothing")
@@ -112,14 +111,7 @@ def main(config: Config) -> dict[str, Any]:
     column = circuit.spec_index(config.spec)
     spec = circuit.specs[column]
     size = circuit.box if config.task == "box" else config.radius
-    search = SearchConfig(
-        Task(config.task, float(size), circuit.n_dims),
-        config.method,
-        seeds=tuple(range(config.first_seed, config.first_seed + config.seeds)),
-        n_init=config.n_init,
-        n_total=config.n_total,
-        embedding_dim=config.embedding_dim,
-    )
+    search = search_of(config, Task(config.task, float(size), circuit.n_dims))
     settings = {
         k: v
         for k, v in dataclasses.asdict(config).items()
@@ -132,11 +124,11 @@ def main(config: Config) -> dict[str, Any]:
     enable_compilation_cache()
     threshold = config.threshold
     if threshold is None:
-        threshold = threshold_for(circuit, column, search.task, config.out)
+        threshold = failure_runs.threshold_for(circuit, column, search.task, config.out)
     sign = 1.0 if spec.sense == "max" else -1.0
     with progress() as bar:
         label = f"{config.circuit} {config.spec} {config.method}"
-        job = bar.add_task(label, total=config.n_total, status="")
+        job = bar.add_task(label, total=search.n_total, status="")
 
         def show(state: SearchState) -> None:
             worst = sign * best_so_far(state.y)[:, -1].max()
@@ -155,13 +147,7 @@ def main(config: Config) -> dict[str, Any]:
     hits = first_hit(state.y, sign * threshold)
     worst = sign * best_so_far(state.y)[:, -1]
     failed = np.argwhere(state.y > sign * threshold)
-    names = [f"{t}.{q}" for t, q in circuit.parameter_names]
-    with (config.out / "failures.csv").open("w", newline="", encoding="utf-8") as file:
-        writer = csv.writer(file)
-        writer.writerow(["seed", "simulation", config.spec, *names])
-        for row, index in failed:
-            values = [f"{v:.6g}" for v in state.x[row, index]]
-            writer.writerow([search.seeds[row], index + 1, sign * state.y[row, index], *values])
+    failure_runs.write_failures(config.out, circuit, column, search.seeds, state, sign * threshold)
     result: dict[str, Any] = {
         "settings": settings,
         "threshold": threshold,
@@ -169,7 +155,7 @@ def main(config: Config) -> dict[str, Any]:
         "first_failure": hits,
         "worst_case": worst,
         "success_rate": float(np.isfinite(hits).mean()),
-        "clipped_share": float(state.clipped[:, config.n_init :].mean()),
+        "clipped_share": float(state.clipped[:, search.n_init :].mean()),
         "invalid": int((state.status != 0).sum()),
         **provenance(),
     }
@@ -178,20 +164,12 @@ def main(config: Config) -> dict[str, Any]:
         again = (np.asarray(status) == 0) & (sign * np.asarray(specs)[:, column] > sign * threshold)
         result["verified"] = {"claimed": len(failed), "confirmed": int(again.sum())}
     write_json(config.out / "result.json", result)
-    plots.plot_trend(
-        config.out / "trend.png",
-        {METHODS[config.method].label: state.y},
-        threshold=sign * threshold,
-        n_init=config.n_init,
-        label=f"{config.spec} [{spec.unit}]",
-    )
-    flat = int(np.nanargmax(state.y))
-    point = state.x.reshape(-1, circuit.n_dims)[flat]
-    plots.plot_activity(
-        config.out / "worst.png", circuit.parameter_names, point, title="worst point [sigma]"
+    label = METHODS[config.method].label
+    point = failure_runs.pictures(
+        config.out, circuit, column, state, sign * threshold, label=label, n_init=search.n_init
     )
     print(f"{len(failed)} failures in {state.y.size} simulations; the worst point, in sigma:")
-    print(describe_points(circuit, point))
+    print(failure_runs.describe_point(circuit, point))
     reached = hits[np.isfinite(hits)]
     print_result(
         threshold=threshold,

@@ -169,19 +169,19 @@ CASES = [
     ),
     Case(
         "circuits.mosfet.level1",
-        lambda vgs, vds, w: mosfet.level1(vgs, vds, devices(w))[0],
+        lambda vgs, vds, w: mosfet.level1(devices(w), vgs, vds)[0],
         transistor,
         (0, 1, 2),
     ),
     Case(
         "circuits.mosfet.ekv",
-        lambda vgs, vds, w: mosfet.ekv(vgs, vds, devices(w))[0],
+        lambda vgs, vds, w: mosfet.ekv(devices(w), vgs, vds)[0],
         transistor,
         (0, 1, 2),
     ),
     Case(
         "circuits.mosfet.drain_current",
-        lambda vg, vd, w: mosfet.drain_current("ekv", vd, vg, jnp.zeros_like(vg), devices(w)),
+        lambda vg, vd, w: mosfet.drain_current("ekv", devices(w), vd, vg, jnp.zeros_like(vg)),
         transistor,
         (0, 1, 2),
     ),

@@ -11,7 +11,8 @@ from scipy.linalg import expm as scipy_expm
 from scipy.stats import spearmanr
 
 from failure import circuits
-from failure.circuits.buck import converter
+from failure.circuits.buck import converter, schematic
+from failure.circuits.buck.circuit import make_dcdc
 from failure.circuits.buck.cycle import Stage, expm, pwm_cycle, stage_matrix
 from failure.circuits.solver import ngspice
 
@@ -41,7 +42,7 @@ def test_cycle_is_the_integrated_circuit(stage: Stage) -> None:
         high = stage_matrix(stage, 2.5 * one, 0.15 * one, 0.2 * one)
         x, t, peak = jax.jit(
             lambda x: pwm_cycle(
-                x, 0.5 * period * one, low, high, ramp_start=0.8 * one, ramp_slope=slope,
+                low, high, x, 0.5 * period * one, ramp_start=0.8 * one, ramp_slope=slope,
                 t_ramp=t_ramp * one, delay=delay * one, period=period, iterations=5,
             )
         )(jnp.asarray(x0)[:, None])  # fmt: skip
@@ -74,7 +75,7 @@ def samples() -> np.ndarray:
 
 def test_interface_and_nominal(samples: np.ndarray) -> None:
     circuit = circuits.get("dcdc")
-    assert circuit.n_dims == 44 and len(converter.MOSFETS) == 22
+    assert circuit.n_dims == 44 and len(schematic.MOSFETS) == 22
     assert circuit.spec_names == ("output_accuracy", "overshoot")
     assert circuit.parameter_names[1] == ("MA1", "width")
     specs, status = map(np.asarray, circuit.simulate(samples))
@@ -99,7 +100,7 @@ def test_metrics_are_smooth() -> None:
 @pytest.mark.slow
 @pytest.mark.skipif(not ngspice.available(), reason="ngspice is not installed")
 def test_ranks_agree_with_every_transistor_switching() -> None:
-    circuit = converter.make_dcdc("level1")
+    circuit = make_dcdc("level1")
     x = np.random.default_rng(0).normal(size=(24, 44))
     ours, status = map(np.asarray, circuit.simulate(x))
     theirs, their_status = circuit.reference(x, max_step=2e-9)

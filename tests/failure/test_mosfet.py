@@ -44,9 +44,9 @@ def test_parameters_of_the_nominal_device() -> None:
 def test_level1_closed_form() -> None:
     with jax.enable_x64(True):
         p = device()
-        saturation, gm, gds = level1(jnp.float64(1.0), jnp.float64(1.5), p)
-        linear, _, _ = level1(jnp.float64(1.0), jnp.float64(0.2), p)
-        off, _, _ = level1(jnp.float64(0.3), jnp.float64(1.0), p)
+        saturation, gm, gds = level1(p, jnp.float64(1.0), jnp.float64(1.5))
+        linear, _, _ = level1(p, jnp.float64(1.0), jnp.float64(0.2))
+        off, _, _ = level1(p, jnp.float64(0.3), jnp.float64(1.0))
     beta = float(p.beta)
     assert float(saturation) == pytest.approx(beta / 2 * 0.55**2 * (1 + 0.08 * 1.5))
     assert float(gm) == pytest.approx(beta * 0.55 * (1 + 0.08 * 1.5))
@@ -65,10 +65,10 @@ def test_conductances_are_the_derivatives(
         p = device(polarity)
 
         def current(d: jax.Array, g: jax.Array, s: jax.Array) -> jax.Array:
-            return drain_current(model, d, g, s, p)[0]
+            return drain_current(model, p, d, g, s)[0]
 
         v = tuple(jnp.float64(x) for x in (vd, vg, vs))
-        _, gm, gds = drain_current(model, *v, p)
+        _, gm, gds = drain_current(model, p, *v)
         by_d, by_g, by_s = jax.grad(current, argnums=(0, 1, 2))(*v)
     close = {"rtol": 1e-7, "atol": 1e-12}
     if model == "level1" and abs(vd - vs) < 1e-9:
@@ -86,8 +86,8 @@ def test_conductances_are_the_derivatives(
 def test_source_and_drain_are_alike(model: str, vd: float, vg: float, vs: float) -> None:
     with jax.enable_x64(True):
         p = device()
-        one = drain_current(model, *(jnp.float64(v) for v in (vd, vg, vs)), p)[0]
-        other = drain_current(model, *(jnp.float64(v) for v in (vs, vg, vd)), p)[0]
+        one = drain_current(model, p, *(jnp.float64(v) for v in (vd, vg, vs)))[0]
+        other = drain_current(model, p, *(jnp.float64(v) for v in (vs, vg, vd)))[0]
     np.testing.assert_allclose(one, -other, rtol=1e-9, atol=1e-18)
 
 
@@ -96,14 +96,17 @@ def test_ekv_limits() -> None:
     with jax.enable_x64(True):
         p = device()._replace(lam=jnp.float64(0.0))
         v = jnp.float64(2.0)
-        strong = ekv(v, v, p)[0] / level1(v, v, p)[0]
+        strong = ekv(p, v, v)[0] / level1(p, v, v)[0]
         low = jnp.array([0.05, 0.06])
-        weak = ekv(low, jnp.full(2, 1.0), jax.tree.map(lambda a: a[None], p))[0]
+        weak = ekv(jax.tree.map(lambda a: a[None], p), low, jnp.full(2, 1.0))[0]
     assert float(strong) == pytest.approx(1.0, abs=1e-3)
     slope = float(jnp.log(weak[1] / weak[0])) / 0.01
     assert slope == pytest.approx(1.0 / (SLOPE * U_T), rel=0.01)
 
 
 def test_unknown_model_names_the_known() -> None:
-    with jax.enable_x64(True), pytest.raises(ValueError, match=r"'bsim4'.*ekv, level1"):
-        drain_current("bsim4", jnp.float64(1), jnp.float64(1), jnp.float64(0), device())
+    with (
+        jax.enable_x64(True),
+        pytest.raises(ValueError, match=r"model='bsim4': expected one of 'ekv', 'level1'"),
+    ):
+        drain_current("bsim4", device(), jnp.float64(1), jnp.float64(1), jnp.float64(0))

@@ -6,10 +6,9 @@ import numpy as np
 import pytest
 from scipy.stats import spearmanr
 
+from failure.circuits.ldo.circuit import make_ldo
 from failure.circuits.ldo.reference import ldo_decks
-from failure.circuits.ldo.regulator import make_ldo
 from failure.circuits.solver import ngspice
-from failure.circuits.solver.mna import nominal_values
 from failure.circuits.solver.netlist import (
     Capacitor,
     CurrentSource,
@@ -20,8 +19,9 @@ from failure.circuits.solver.netlist import (
     Switch,
     VoltageSource,
 )
-from failure.circuits.solver.solve import dc
+from failure.circuits.solver.newton import dc
 from failure.circuits.solver.system import compile_netlist
+from failure.circuits.solver.values import nominal_values
 
 needs_ngspice = pytest.mark.skipif(not ngspice.available(), reason="ngspice is not installed")
 

@@ -8,14 +8,14 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from failure.simulators.wrappers import (
-    FAILED,
-    GOOD,
-    NOT_FINITE,
-    TIMED_OUT,
-    Cache,
-    CommandSimulator,
-    FunctionSimulator,
+from failure import CommandSimulator, FunctionSimulator, Status
+from failure.simulators.cache import Cache
+
+GOOD, FAILED, TIMED_OUT, NOT_FINITE = (
+    Status.GOOD,
+    Status.FAILED,
+    Status.TIMED_OUT,
+    Status.NOT_FINITE,
 )
 
 PROGRAM = """
@@ -143,11 +143,11 @@ def test_function_that_hangs_is_ended() -> None:
 
 def test_bad_settings_and_rows_are_named(program) -> None:
     argv, _ = program
-    with pytest.raises(ValueError, match="workers = 0"):
+    with pytest.raises(ValueError, match="workers=0"):
         CommandSimulator(argv, 2, workers=0)
-    with pytest.raises(ValueError, match="timeout = -1"):
+    with pytest.raises(ValueError, match="timeout=-1"):
         CommandSimulator(argv, 2, timeout=-1.0)
-    with pytest.raises(ValueError, match="row 1 of x is not finite"):
+    with pytest.raises(ValueError, match=r"x\[1\]=.*expected finite"):
         CommandSimulator(argv, 2)(np.array([[0.0], [np.nan]]))
     with pytest.raises(ValueError, match="no-such-simulator"):
         CommandSimulator(["no-such-simulator"], 1)(np.zeros((1, 1)))

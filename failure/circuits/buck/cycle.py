@@ -115,18 +115,19 @@ def stage_matrix(
 
 
 def walk(
-    x: Float[Array, "n b"],
     a: Float[Array, "n n b"],
     row: Float[Array, "n b"],
+    x: Float[Array, "n b"],
     length: Float[Array, "b"],
+    *,
     points: int,
 ) -> tuple[Float[Array, "n b"], Float[Array, "b"]]:
     """Move the state over a segment and find the largest output on the way.
 
     Args:
-        x: state at the start.
         a: generator of the segment.
         row: reads the output.
+        x: state at the start.
         length: of the segment [s].
         points: samples of the output; between two of them the vertex of a parabola counts.
     Returns:
@@ -150,9 +151,9 @@ def walk(
 
 
 def until(
-    x: Float[Array, "n b"],
     a: Float[Array, "n n b"],
     row: Float[Array, "n b"],
+    x: Float[Array, "n b"],
     t_guess: Float[Array, "b"],
     *,
     iterations: int = 4,
@@ -160,9 +161,9 @@ def until(
     """Time at which `row` times the state passes zero, by Newton on the exact trajectory.
 
     Args:
-        x: state at the start.
         a: generator.
         row: what passes zero; falling or rising steadily.
+        x: state at the start.
         t_guess: start [s].
         iterations: Newton steps.
     Returns:
@@ -177,10 +178,10 @@ def until(
 
 
 def pwm_cycle(
-    x: Float[Array, "5 b"],
-    t_guess: Float[Array, "b"],
     low: tuple[Array, Array, Array],
     high: tuple[Array, Array, Array],
+    x: Float[Array, "5 b"],
+    t_guess: Float[Array, "b"],
     *,
     ramp_start: Float[Array, "b"],
     ramp_slope: float,
@@ -196,9 +197,9 @@ def pwm_cycle(
     (t - t_ramp)`; the trip time is found by Newton on the exact trajectory.
 
     Args:
+        low, high: `stage_matrix` of the two halves.
         x: state at the fall.
         t_guess: trip time of the last period [s].
-        low, high: `stage_matrix` of the two halves.
         ramp_start, ramp_slope, t_ramp: the ramp [V], [V/s], and where it starts [s].
         delay: from the meeting to the rise of the switching node [s].
         period: [s].
@@ -219,6 +220,6 @@ def pwm_cycle(
         t = jnp.clip(t - gap / jnp.minimum(rate, -0.2 * ramp_slope), least, most)
     rise = jnp.clip(t + delay, least, most)
 
-    x, first = walk(x, a_low, out_low, rise, points)
-    x, second = walk(x, a_high, out_high, period - rise, points)
+    x, first = walk(a_low, out_low, x, rise, points=points)
+    x, second = walk(a_high, out_high, x, period - rise, points=points)
     return x, jax.lax.stop_gradient(t), jnp.maximum(first, second)

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from failure.circuits.buck import converter
+from failure.circuits.buck import schematic
 from failure.circuits.solver import ngspice
 from failure.circuits.solver.netlist import (
     Capacitor,
@@ -22,26 +22,26 @@ __all__ = ["FULL", "dcdc_decks", "dcdc_reference"]
 FULL = Netlist(
     "buck converter",
     (
-        VoltageSource("Vdd", "vdd", "0", converter.V_DD),
-        VoltageSource("Vnb", "nb", "0", converter.V_BIAS),
-        VoltageSource("Vref", "ref", "0", converter.V_REF),
-        *converter.MOSFETS,
-        Resistor("Rcoil", "lx", "out", converter.R_COIL),
-        Capacitor("Cout", "out", "oe", converter.CAPACITANCE),
-        Resistor("Resr", "oe", "0", converter.R_ESR),
+        VoltageSource("Vdd", "vdd", "0", schematic.V_DD),
+        VoltageSource("Vnb", "nb", "0", schematic.V_BIAS),
+        VoltageSource("Vref", "ref", "0", schematic.V_REF),
+        *schematic.MOSFETS,
+        Resistor("Rcoil", "lx", "out", schematic.R_COIL),
+        Capacitor("Cout", "out", "oe", schematic.CAPACITANCE),
+        Resistor("Resr", "oe", "0", schematic.R_ESR),
         # The probe of the feedback pin: its 0.1 ns is left out of the cycle map.
         Resistor("Rfb", "out", "fb", 1e3),
         Capacitor("Cfb", "fb", "0", 1e-13),
-        Resistor("Rcomp", "comp", "ref", converter.R_COMP),
-        Capacitor("Czero", "comp", "cz", converter.C_ZERO),
-        Resistor("Rzero", "cz", "fb", converter.R_ZERO),
-        CurrentSource("Iload", "out", "0", converter.LOAD_HEAVY),
+        Resistor("Rcomp", "comp", "ref", schematic.R_COMP),
+        Capacitor("Czero", "comp", "cz", schematic.C_ZERO),
+        Resistor("Rzero", "cz", "fb", schematic.R_ZERO),
+        CurrentSource("Iload", "out", "0", schematic.LOAD_HEAVY),
     ),
 )
 """The converter without its coil and ramp, which the deck adds with their own syntax."""
 
-_T_STEP = converter.N_BEFORE * converter.PERIOD
-_T_END = (converter.N_BEFORE + converter.N_AFTER) * converter.PERIOD
+_T_STEP = schematic.N_BEFORE * schematic.PERIOD
+_T_END = (schematic.N_BEFORE + schematic.N_AFTER) * schematic.PERIOD
 
 
 def dcdc_decks(
@@ -59,28 +59,28 @@ def dcdc_decks(
     """
     u = np.asarray(x, np.float64).reshape(len(x), -1, 2).transpose(1, 2, 0)
     with jax.enable_x64(True):
-        values = converter.variation(
-            compile_netlist(FULL, "level1"), converter.MOSFETS, jnp.asarray(u)
+        values = schematic.variation(
+            compile_netlist(FULL, "level1"), schematic.MOSFETS, jnp.asarray(u)
         )
     values = jax.tree.map(np.asarray, values)
-    (_, _, s_length), (_, _, s_width) = converter.QUANTITIES
-    width = np.array([[m.width] for m in converter.MOSFETS]) * (1.0 + s_width * u[:, 1])
-    length = np.array([[m.length] for m in converter.MOSFETS]) * (1.0 + s_length * u[:, 0])
+    (_, _, s_length), (_, _, s_width) = schematic.QUANTITIES
+    width = np.array([[m.width] for m in schematic.MOSFETS]) * (1.0 + s_width * u[:, 1])
+    length = np.array([[m.length] for m in schematic.MOSFETS]) * (1.0 + s_length * u[:, 0])
     load = (
-        (0.0, converter.LOAD_HEAVY),
-        (_T_STEP, converter.LOAD_HEAVY),
-        (_T_STEP + 1e-9, converter.LOAD_LIGHT),
-        (1.0, converter.LOAD_LIGHT),
+        (0.0, schematic.LOAD_HEAVY),
+        (_T_STEP, schematic.LOAD_HEAVY),
+        (_T_STEP + 1e-9, schematic.LOAD_LIGHT),
+        (1.0, schematic.LOAD_LIGHT),
     )
     own = [
-        f"Vramp ramp 0 PULSE({converter.RAMP_LOW!r} {converter.RAMP_HIGH!r} 0 "
-        f"{converter.RAMP_RISE!r} {converter.RAMP_FALL!r} {converter.RAMP_TOP!r} "
-        f"{converter.PERIOD!r})",
-        f"L1 sw lx {converter.INDUCTANCE!r} ic=0.2",
+        f"Vramp ramp 0 PULSE({schematic.RAMP_LOW!r} {schematic.RAMP_HIGH!r} 0 "
+        f"{schematic.RAMP_RISE!r} {schematic.RAMP_FALL!r} {schematic.RAMP_TOP!r} "
+        f"{schematic.PERIOD!r})",
+        f"L1 sw lx {schematic.INDUCTANCE!r} ic=0.2",
     ]
     control = [
         f"tran {max_step!r} {_T_END!r} 0 {max_step!r} uic",
-        f"meas tran vmean avg v(out) from={_T_STEP - 8 * converter.PERIOD!r} to={_T_STEP!r}",
+        f"meas tran vmean avg v(out) from={_T_STEP - 8 * schematic.PERIOD!r} to={_T_STEP!r}",
         f"meas tran vpeak max v(out) from={_T_STEP!r} to={_T_END!r}",
         "print vmean",
         "print vpeak",
@@ -124,4 +124,4 @@ def dcdc_reference(
     decks = dcdc_decks(x, model=model, max_step=max_step)
     numbers, status = ngspice.run_many(decks, ("vmean", "vpeak"), workers=workers, timeout=timeout)
     mean, peak = numbers.T
-    return np.stack([np.abs(mean - converter.V_REF), peak - converter.V_REF], axis=1), status
+    return np.stack([np.abs(mean - schematic.V_REF), peak - schematic.V_REF], axis=1), status

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import math
-from functools import lru_cache, partial
+from functools import lru_cache
 from typing import NamedTuple
 
 import jax
@@ -11,8 +11,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from failure.circuits.protocol import Circuit, Spec, in_chunks
-from failure.circuits.solver.mna import Values, nominal_values, source_current
+from failure.circuits.protocol import Spec
+from failure.circuits.solver.mna import source_current
 from failure.circuits.solver.mosfet import NMOS, PMOS, mos_params
 from failure.circuits.solver.netlist import (
     Capacitor,
@@ -23,8 +23,10 @@ from failure.circuits.solver.netlist import (
     Resistor,
     VoltageSource,
 )
-from failure.circuits.solver.solve import Grid, dc, grid, transient
+from failure.circuits.solver.newton import dc
 from failure.circuits.solver.system import System, compile_netlist
+from failure.circuits.solver.transient import Grid, grid, transient
+from failure.circuits.solver.values import Values, nominal_values
 
 __all__ = [
     "I_HEAVY",
@@ -33,9 +35,10 @@ __all__ = [
     "QUANTITIES",
     "SPECS",
     "TIME",
-    "make_ldo",
+    "lowest",
     "solve_ldo",
     "time_grid",
+    "variation",
 ]
 
 KNEE = 1.0
@@ -196,7 +199,7 @@ def solve_ldo(
     light = dc(system, at_light, jnp.asarray(light0))
     amps = np.interp(time.t, [0.0, T_STEP, T_STEP + T_RISE], [I_LIGHT, I_LIGHT, I_HEAVY])
     wave = {"Bload": jnp.asarray(amps, x.dtype).reshape(-1, 1)}
-    (out,), end = transient(system, at_light, light, time, wave, probes=("out",))
+    (out,), end = transient(system, time, at_light, light, wave, probes=("out",))
     # The DC point that belongs to this transient, should the circuit have more than one.
     near = jnp.where((end.status == 0)[None], end.v, jnp.asarray(heavy0))
     heavy = dc(system, at_heavy, near)
@@ -205,7 +208,7 @@ def solve_ldo(
     i_load = I_LIGHT * jnp.tanh(before / KNEE)
     specs = jnp.stack(
         [
-            source_current(system, light.v, at_light, "Vin") - i_load,
+            source_current(system, at_light, light.v, name="Vin") - i_load,
             out[0] - lowest(time.t, out),
             100.0 * (before - after) / before,
         ]
@@ -225,30 +228,3 @@ def lowest(t: np.ndarray, v: Float[Array, "t b"]) -> Float[Array, "b"]:
     inside = (sl < 0.0) & (sr > 0.0)
     gain = jnp.where(inside, slope * slope / (4.0 * jnp.where(inside, bend, 1.0)), 0.0)
     return jnp.min(v, axis=0) - gain
-
-
-def _run(x: Float[Array, "n d"], *, model: str) -> tuple[Array, Array]:
-    return in_chunks(partial(solve_ldo, model=model), x)
-
-
-@lru_cache(maxsize=4)
-def make_ldo(model: str = "ekv") -> Circuit:
-    """The LDO regulator: 60 parameters, quiescent current, undershoot and load regulation.
-
-    Args:
-        model: MOSFET model, "ekv" (smooth, default) or "level1".
-    Returns:
-        Circuit.
-    """
-    from failure.circuits.ldo.reference import ldo_reference
-
-    mosfets = NETLIST.of(Mosfet)
-    return Circuit(
-        name="ldo" if model == "ekv" else f"ldo_{model}",
-        parameter_names=tuple((m.name, q) for m in mosfets for q, _, _ in QUANTITIES),
-        sigma=tuple(s for _ in mosfets for _, _, s in QUANTITIES),
-        parameter_units=tuple(u for _ in mosfets for _, u, _ in QUANTITIES),
-        specs=SPECS,
-        run=partial(_run, model=model),
-        reference=partial(ldo_reference, model=model),
-    )

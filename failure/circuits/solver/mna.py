@@ -1,8 +1,7 @@
 """Modified nodal analysis: the batched residual of a compiled netlist and its sparse Jacobian.
 
-The batch is the last axis of every array. The Jacobian is
-a dictionary of its structurally nonzero entries, each `[batch]`; elimination runs without pivoting
-in minimum-degree order and is unrolled when it is traced, so that XLA sees straight-line code.
+The batch is the last axis of every array. The Jacobian is a dictionary of its structurally nonzero
+entries, each `[batch]`.
 """
 
 from __future__ import annotations
@@ -14,12 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from failure.circuits.solver.mosfet import MosParams, drain_current, mos_params
+from failure.circuits.solver.elimination import Entries, add_entry
+from failure.circuits.solver.mosfet import MosParams, drain_current
 from failure.circuits.solver.netlist import (
     GROUND,
     Capacitor,
     CurrentSource,
-    Inductor,
     Load,
     Mosfet,
     Resistor,
@@ -27,13 +26,16 @@ from failure.circuits.solver.netlist import (
     VoltageSource,
 )
 from failure.circuits.solver.system import System, branches, pattern
+from failure.circuits.solver.values import Values, batch_size
 
 __all__ = [
     "GMIN",
     "Stamps",
-    "Values",
-    "eliminate",
-    "nominal_values",
+    "assemble",
+    "capacitance",
+    "conductance",
+    "keys",
+    "known_voltages",
     "residual",
     "source_current",
     "stamps",
@@ -41,54 +43,6 @@ __all__ = [
 
 GMIN = 1e-12
 """Conductance from every unknown node to ground [S]."""
-
-Entries = dict[tuple[int, int], Array]
-
-
-class Values(NamedTuple):
-    """Element values; leaves `[n_elements_of_that_kind, batch]`, or `[..., 1]` when common."""
-
-    mos: MosParams
-    ohms: Float[Array, "r b"]
-    farads: Float[Array, "c b"]
-    henries: Float[Array, "l b"]
-    volts: Float[Array, "v b"]
-    amps: Float[Array, "i b"]
-    load: Float[Array, "o b"]
-    control: Float[Array, "s b"]
-
-
-def nominal_values(system: System) -> Values:
-    """Values of the netlist as drawn, leaves `[n, 1]`, float64 inside `jax.enable_x64`."""
-
-    def column(kind: type, attribute: str) -> Array:
-        return jnp.array([getattr(e, attribute) for e in system.netlist.of(kind)]).reshape(-1, 1)
-
-    def process(attribute: str) -> Array:
-        return jnp.array(
-            [getattr(e.process, attribute) for e in system.netlist.of(Mosfet)]
-        ).reshape(-1, 1)
-
-    mos = mos_params(
-        process("polarity"),
-        process("mobility"),
-        process("early"),
-        process("overlap"),
-        width=column(Mosfet, "width"),
-        length=column(Mosfet, "length"),
-        vto=process("vto"),
-        tox=process("tox"),
-    )
-    return Values(
-        mos=mos,
-        ohms=column(Resistor, "ohms"),
-        farads=column(Capacitor, "farads"),
-        henries=column(Inductor, "henries"),
-        volts=column(VoltageSource, "volts"),
-        amps=column(CurrentSource, "amps"),
-        load=column(Load, "amps"),
-        control=column(Switch, "control"),
-    )
 
 
 class Stamps(NamedTuple):
@@ -104,16 +58,12 @@ class Stamps(NamedTuple):
     load: Float[Array, "o b"]
 
 
-def _add(entries: Entries, i: int, j: int, value: Array) -> None:
-    entries[i, j] = entries[i, j] + value if (i, j) in entries else value
-
-
 def _pair(entries: Entries, system: System, p: str, n: str, g: Array) -> None:
     """Stamp a conductance between two nodes, rows of known nodes left out."""
     i, j = system.index(p), system.index(n)
     for row, column, sign in ((i, i, 1.0), (i, j, -1.0), (j, j, 1.0), (j, i, -1.0)):
         if row < system.n:
-            _add(entries, row, column, sign * g)
+            add_entry(entries, row, column, sign * g)
 
 
 def known_voltages(system: System, values: Values, batch: int) -> Float[Array, "k b"]:
@@ -139,7 +89,7 @@ def conductance(system: System, values: Values) -> tuple[Entries, dict[int, Arra
     const: dict[int, Array] = {}
     one = jnp.ones((batch_size(values),), values.volts.dtype)
     for i in range(system.n_nodes):
-        _add(entries, i, i, GMIN * one)
+        add_entry(entries, i, i, GMIN * one)
     for k, r in enumerate(system.netlist.of(Resistor)):
         _pair(entries, system, r.p, r.n, 1.0 / values.ohms[k])
     for k, s in enumerate(system.netlist.of(Switch)):
@@ -156,8 +106,8 @@ def conductance(system: System, values: Values) -> tuple[Entries, dict[int, Arra
         for node, sign in ((b.p, 1.0), (b.n, -1.0)):
             i = system.index(node)
             if i < system.n:
-                _add(entries, i, row, sign * one)
-            _add(entries, row, i, sign * one)
+                add_entry(entries, i, row, sign * one)
+            add_entry(entries, row, i, sign * one)
         if isinstance(b, VoltageSource):
             const[row] = -values.volts[sources.index(b)]
     return entries, const
@@ -203,21 +153,15 @@ def assemble(
     return Stamps(jnp.stack(linear), jnp.stack(rows), known, values.mos, values.load)
 
 
-def batch_size(values: Values) -> int:
-    """The common length of the last axis."""
-    leaves = [*values.mos, *values[1:]]
-    return max(leaf.shape[-1] for leaf in leaves if leaf.shape[0])
-
-
 def residual(
-    system: System, v: Float[Array, "n b"], s: Stamps
+    system: System, s: Stamps, v: Float[Array, "n b"]
 ) -> tuple[Float[Array, "n b"], Entries]:
     """Sum of the currents that leave each node, and its Jacobian.
 
     Args:
         system: compiled netlist.
-        v: unknowns.
         s: Stamps.
+        v: unknowns.
     Returns:
         (F `[n, b]`, entries `(i, j) -> [b]`).
     """
@@ -234,7 +178,7 @@ def residual(
 
     def slope(i: int, j: int, g: Array) -> None:
         if i < system.n and j < system.n:
-            _add(entries, i, j, g)
+            add_entry(entries, i, j, g)
 
     mosfets = system.netlist.of(Mosfet)
     if mosfets:
@@ -242,7 +186,7 @@ def residual(
             np.array([system.index(getattr(m, a)) for m in mosfets])
             for a in ("drain", "gate", "source")
         )
-        current, gm, gds = drain_current(system.model, full[d], full[g], full[t], s.mos)
+        current, gm, gds = drain_current(system.model, s.mos, full[d], full[g], full[t])
         for k in range(len(mosfets)):
             i, j, o = int(d[k]), int(g[k]), int(t[k])
             put(i, current[k])
@@ -263,44 +207,8 @@ def residual(
     return jnp.stack(rows), entries
 
 
-def eliminate(system: System, entries: Entries, rhs: Float[Array, "n b"]) -> Float[Array, "n b"]:
-    """Solve the sparse system for one right-hand side, batch last, without pivoting.
-
-    Args:
-        system: gives the order.
-        entries: `(i, j) -> [b]`.
-        rhs: right-hand sides.
-    Returns:
-        Solution `[n, b]`.
-    Deviation: LU with partial pivoting is safer; nodal matrices with gmin on the diagonal do not
-        need it here, and a small pivot shows up as a sample that does not converge.
-    """
-    a = dict(entries)
-    b = [rhs[i] for i in range(system.n)]
-    done: set[int] = set()
-    inverse: dict[int, Array] = {}
-    for p in system.order:
-        done.add(p)
-        below = sorted(i for (i, j) in a if j == p and i not in done)
-        right = sorted(j for (i, j) in a if i == p and j not in done)
-        inverse[p] = 1.0 / a[p, p]
-        for i in below:
-            factor = a[i, p] * inverse[p]
-            for j in right:
-                _add(a, i, j, -factor * a[p, j])
-            b[i] = b[i] - factor * b[p]
-    x: dict[int, Array] = {}
-    position = {p: k for k, p in enumerate(system.order)}
-    for p in reversed(system.order):
-        value = b[p]
-        for j in sorted(j for (i, j) in a if i == p and position[j] > position[p]):
-            value = value - a[p, j] * x[j]
-        x[p] = value * inverse[p]
-    return jnp.stack([x[i] for i in range(system.n)])
-
-
 def source_current(
-    system: System, v: Float[Array, "n b"], values: Values, name: str
+    system: System, values: Values, v: Float[Array, "n b"], *, name: str
 ) -> Float[Array, "b"]:
     """DC current that a grounded voltage source delivers into the circuit [A].
 
@@ -309,7 +217,9 @@ def source_current(
     """
     at = {s.name: s.p for s in system.netlist.of(VoltageSource) if s.n == GROUND}
     if name not in at:
-        raise ValueError(f"no grounded voltage source {name!r}; known: {', '.join(at)}")
+        raise ValueError(
+            f"name={name!r}: expected a grounded voltage source; known: {', '.join(at)}"
+        )
     node = at[name]
     batch = batch_size(values)
     full = jnp.concatenate([v, known_voltages(system, values, batch)])
@@ -330,6 +240,6 @@ def source_current(
         if node in (m.drain, m.source):
             vd, vg, vs = (full[system.index(t)] for t in (m.drain, m.gate, m.source))
             params = MosParams(*(leaf[k] for leaf in values.mos))
-            current, _, _ = drain_current(system.model, vd, vg, vs, params)
+            current, _, _ = drain_current(system.model, params, vd, vg, vs)
             total = total + ((m.drain == node) - (m.source == node)) * current
     return total

@@ -115,7 +115,7 @@ def mos_params(
 
 
 def level1(
-    vgs: Float[Array, "..."], vds: Float[Array, "..."], params: MosParams
+    params: MosParams, vgs: Float[Array, "..."], vds: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     r"""Square-law drain current of an n-channel device and its two conductances.
 
@@ -126,8 +126,8 @@ def level1(
     places.
 
     Args:
-        vgs, vds: terminal voltages [V], for a p-channel device with the sign turned.
         params: MosParams.
+        vgs, vds: terminal voltages [V], for a p-channel device with the sign turned.
     Returns:
         (I [A], dI/dv_gs, dI/dv_ds [A/V]).
     Source: Shichman and Hodges (1968), as in SPICE level 1 with gamma = 0.
@@ -159,7 +159,7 @@ def _softplus(u: Float[Array, "..."]) -> tuple[Float[Array, "..."], Float[Array,
 
 
 def ekv(
-    vgs: Float[Array, "..."], vds: Float[Array, "..."], params: MosParams
+    params: MosParams, vgs: Float[Array, "..."], vds: Float[Array, "..."]
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     r"""Smooth EKV drain current of an n-channel device and its two conductances.
 
@@ -171,8 +171,8 @@ def ekv(
     differentiable, symmetric in source and drain; tends to `level1` far above threshold.
 
     Args:
-        vgs, vds: terminal voltages [V], for a p-channel device with the sign turned.
         params: MosParams.
+        vgs, vds: terminal voltages [V], for a p-channel device with the sign turned.
     Returns:
         (I [A], dI/dv_gs, dI/dv_ds [A/V]).
     Source: Enz, Krummenacher and Vittoz (1995), interpolation function of their Eq. 46.
@@ -201,26 +201,26 @@ MODELS = {"ekv": ekv, "level1": level1}
 
 def drain_current(
     model: str,
+    params: MosParams,
     vd: Float[Array, "..."],
     vg: Float[Array, "..."],
     vs: Float[Array, "..."],
-    params: MosParams,
 ) -> tuple[Float[Array, "..."], Float[Array, "..."], Float[Array, "..."]]:
     """Current into the drain terminal, its derivatives to the gate and the drain voltage.
 
     Args:
         model: "ekv" or "level1".
-        vd, vg, vs: node voltages [V].
         params: MosParams.
+        vd, vg, vs: node voltages [V].
     Returns:
         (I_d [A], dI_d/dv_g, dI_d/dv_d [A/V]); dI_d/dv_s is minus their sum.
     Raises:
         ValueError: unknown model.
     """
     if model not in MODELS:
-        raise ValueError(f"unknown MOSFET model {model!r}; known: {', '.join(MODELS)}")
+        raise ValueError(f"model={model!r}: expected one of {', '.join(map(repr, MODELS))}")
     p = params.polarity
-    current, gm, gds = MODELS[model](p * (vg - vs), p * (vd - vs), params)
+    current, gm, gds = MODELS[model](params, p * (vg - vs), p * (vd - vs))
     # The barrier keeps XLA from computing exp and log again for every matrix entry they feed.
     out: tuple[Array, Array, Array] = jax.lax.optimization_barrier((p * current, gm, gds))
     return out

@@ -136,7 +136,7 @@ class Netlist:
                 value = getattr(e, attribute, 1.0)
                 if not value > 0.0:
                     raise ValueError(
-                        f"{self.title}: {e.name}.{attribute} = {value!r} must be positive"
+                        f"{self.title}: {e.name}.{attribute}={value!r}: expected a positive number"
                     )
         if self.elements and GROUND not in self.nodes():
             raise ValueError(f'{self.title}: no element touches ground (node "{GROUND}")')

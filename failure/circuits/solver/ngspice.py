@@ -18,7 +18,6 @@ from typing import Any
 
 import numpy as np
 
-from failure.circuits.solver.mna import Values
 from failure.circuits.solver.mosfet import EPS_OX, SLOPE, SMOOTH_VDS, U_T, MosParams
 from failure.circuits.solver.netlist import (
     Capacitor,
@@ -31,6 +30,7 @@ from failure.circuits.solver.netlist import (
     Switch,
     VoltageSource,
 )
+from failure.circuits.solver.values import Values
 
 __all__ = ["NgspiceError", "available", "deck", "elements", "require", "run", "run_many"]
 

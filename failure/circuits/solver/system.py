@@ -64,7 +64,9 @@ class System:
         """
         names = (*self.unknowns, *self.known)
         if node not in names:
-            raise ValueError(f"no node {node!r} in {self.netlist.title}; known: {', '.join(names)}")
+            raise ValueError(
+                f"node={node!r}: expected a node of {self.netlist.title}; known: {', '.join(names)}"
+            )
         return names.index(node)
 
 
@@ -81,7 +83,7 @@ def compile_netlist(netlist: Netlist, model: str = "ekv") -> System:
             connections are inductors, floating sources or gates, so that nothing pins it at DC.
     """
     if model not in MODELS:
-        raise ValueError(f"unknown MOSFET model {model!r}; known: {', '.join(MODELS)}")
+        raise ValueError(f"model={model!r}: expected one of {', '.join(map(repr, MODELS))}")
     fixed: dict[str, int] = {}
     for k, source in enumerate(netlist.of(VoltageSource)):
         if source.n == GROUND:

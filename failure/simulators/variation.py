@@ -1,0 +1,251 @@
+"""What varies in a netlist: physical values of samples that a search describes in sigma."""
+
+from __future__ import annotations
+
+import csv
+import re
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple
+
+import numpy as np
+from jaxtyping import Float
+
+from failure.simulators.spice import parse_number
+
+__all__ = ["Corner", "Variation", "Varied", "parse_corner", "parse_variation", "pvt_corners"]
+
+
+class Varied(NamedTuple):
+    """A parameter that varies: `nominal + sigma z`, or `nominal (1 + sigma z)` when relative."""
+
+    name: str
+    sigma: float
+    relative: bool
+
+
+class Corner(NamedTuple):
+    """A condition in which every sample is simulated: parameters, temperature, library section."""
+
+    name: str
+    values: tuple[tuple[str, float], ...] = ()
+    temperature: float | None = None
+    section: str | None = None
+
+
+def parse_varied(text: str) -> Varied:
+    """`name:sigma`; a sigma in percent is relative to the nominal value.
+
+    Raises:
+        ValueError: another form, or a sigma that is not positive.
+
+    Example:
+        >>> parse_varied("rl:1%")
+        Varied(name='rl', sigma=0.01, relative=True)
+    """
+    name, colon, sigma = (part.strip() for part in text.partition(":"))
+    relative = sigma.endswith("%")
+    try:
+        value = parse_number(sigma.removesuffix("%"))
+    except ValueError:
+        colon = ""
+        value = 0.0
+    if not colon or not re.fullmatch(r"[A-Za-z_]\w*", name) or not value > 0.0:
+        raise ValueError(
+            f"vary={text!r}: expected NAME:SIGMA with SIGMA above 0, absolute (2m) or relative (1%)"
+        )
+    return Varied(name.lower(), value / 100.0 if relative else value, relative)
+
+
+@dataclass(frozen=True)
+class Variation:
+    r"""The varied parameters and how they go together.
+
+    .. math:: z = L x, \qquad L L^T = C, \qquad p = p_0 + \sigma z \ \text{ or }\ p_0 (1 + \sigma z)
+
+    with `x` independent, each N(0, 1), and C the correlation matrix.
+    """
+
+    varied: tuple[Varied, ...]
+    correlation: Float[np.ndarray, "d d"]
+
+    def __post_init__(self) -> None:
+        names = [v.name for v in self.varied]
+        if not names:
+            raise ValueError("vary=[]: expected at least one NAME:SIGMA")
+        twice = sorted({n for n in names if names.count(n) > 1})
+        if twice:
+            raise ValueError(f"vary={twice[0]!r}: expected once; it is given twice")
+        matrix = np.asarray(self.correlation, np.float64)
+        n = len(names)
+        symmetric = matrix.shape == (n, n) and np.allclose(matrix, matrix.T)
+        if not symmetric or not np.allclose(np.diag(matrix), 1.0):
+            raise ValueError(
+                f"correlation of shape {matrix.shape}: expected a symmetric [{n}, {n}] with ones "
+                "on its diagonal"
+            )
+        least = float(np.linalg.eigvalsh(matrix)[0])
+        if least <= 1e-9:
+            raise ValueError(
+                f"correlation: expected a positive definite matrix; its least eigenvalue is "
+                f"{least:.3g}: the groups contradict each other, or two parameters are one"
+            )
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        """Names of the parameters."""
+        return tuple(v.name for v in self.varied)
+
+    @property
+    def factor(self) -> Float[np.ndarray, "d d"]:
+        """L, lower triangular."""
+        return np.linalg.cholesky(np.asarray(self.correlation, np.float64))
+
+    def physical(
+        self, x: Float[np.ndarray, "n d"], nominal: Float[np.ndarray, "d"]
+    ) -> Float[np.ndarray, "n d"]:
+        """Values of the parameters of samples in sigma."""
+        shift = np.asarray(x, np.float64) @ self.factor.T * self._scale(nominal)
+        return nominal + shift
+
+    def standard(
+        self, values: Float[np.ndarray, "n d"], nominal: Float[np.ndarray, "d"]
+    ) -> Float[np.ndarray, "n d"]:
+        """Samples in sigma of given values, the inverse of `physical`."""
+        z = (np.asarray(values, np.float64) - nominal) / self._scale(nominal)
+        return np.linalg.solve(self.factor, z.T).T
+
+    def _scale(self, nominal: Float[np.ndarray, "d"]) -> Float[np.ndarray, "d"]:
+        relative = np.array([v.relative for v in self.varied])
+        sigma = np.array([v.sigma for v in self.varied])
+        zero = relative & (nominal == 0.0)
+        if zero.any():
+            name = self.names[int(np.argmax(zero))]
+            raise ValueError(
+                f"vary={name!r}: expected an absolute sigma; a relative one of a parameter that is "
+                "0 is nothing"
+            )
+        return np.where(relative, np.abs(nominal), 1.0) * sigma
+
+
+def parse_variation(vary: Sequence[str], correlate: Sequence[str] = ()) -> Variation:
+    """The variation that the options of a command describe.
+
+    Args:
+        vary: `name:sigma`, each.
+        correlate: `a,b,c:0.8` gives all pairs of a group one coefficient; `FILE.csv` a whole
+            matrix, its first line the names.
+    Raises:
+        ValueError: another form, an unknown name, or no correlation matrix.
+
+    Example:
+        >>> v = parse_variation(["a:1m", "b:2%"], ["a,b:0.5"])
+        >>> v.physical(np.array([[1.0, 0.0]]), np.array([0.0, 100.0])).tolist()
+        [[0.001, 101.0]]
+    """
+    varied = tuple(parse_varied(v) for v in vary)
+    names = [v.name for v in varied]
+    matrix = np.eye(len(names))
+
+    def row(name: str, text: str) -> int:
+        if name.strip().lower() not in names:
+            raise ValueError(f"correlate={text!r}: expected names of vary ({', '.join(names)})")
+        return names.index(name.strip().lower())
+
+    for text in correlate:
+        if text.lower().endswith(".csv"):
+            with Path(text).open(newline="", encoding="utf-8") as file:
+                head, *rows = list(csv.reader(file))
+            places = [row(name, text) for name in head]
+            try:
+                matrix[np.ix_(places, places)] = np.array(rows, np.float64)
+            except ValueError as error:
+                raise ValueError(
+                    f"correlate={text!r}: expected a line of names and a square of numbers"
+                ) from error
+            continue
+        members, colon, value = text.rpartition(":")
+        try:
+            coefficient = float(value)
+        except ValueError:
+            colon, coefficient = "", 0.0
+        places = [row(name, text) for name in members.split(",")] if colon else []
+        if len(places) < 2 or not -1.0 < coefficient < 1.0:
+            raise ValueError(
+                f"correlate={text!r}: expected NAME,NAME:RHO with RHO between -1 and 1, or FILE.csv"
+            )
+        for i in places:
+            for j in places:
+                if i != j:
+                    matrix[i, j] = coefficient
+    return Variation(varied, matrix)
+
+
+def _values(text: str, name: str) -> dict[str, str]:
+    found = {}
+    for part in filter(None, (p.strip() for p in text.split(","))):
+        key, equals, value = (p.strip() for p in part.partition("="))
+        if not equals or not key or not value:
+            raise ValueError(f"corners={name!r}: expected NAME:PARAMETER=VALUE,...; got {part!r}")
+        found[key.lower()] = value
+    return found
+
+
+def parse_corner(text: str) -> Corner:
+    """`ss:vtn=0.5,kpn=160u,temp=125,lib=ss`; a name alone is the netlist as it stands.
+
+    Raises:
+        ValueError: another form.
+
+    Example:
+        >>> parse_corner("hot:temp=125,vdd=1.6")
+        Corner(name='hot', values=(('vdd', 1.6),), temperature=125.0, section=None)
+    """
+    name, _, rest = text.partition(":")
+    given = _values(rest, name)
+    section = given.pop("lib", None)
+    temperature = given.pop("temp", None)
+    return Corner(
+        name.strip(),
+        tuple((k, parse_number(v)) for k, v in given.items()),
+        None if temperature is None else float(temperature),
+        section,
+    )
+
+
+def pvt_corners(corners: Sequence[str], lists: Sequence[str]) -> tuple[Corner, ...]:
+    """All corners: each process corner at each combination of the lists.
+
+    Args:
+        corners: see `parse_corner`; the netlist as it stands when there are none.
+        lists: `temp=-40,27,125`, `vdd=1.62,1.8,1.98`: a parameter or the temperature, its values.
+    Raises:
+        ValueError: another form, or two corners of one name.
+
+    Example:
+        >>> [c.name for c in pvt_corners(["tt", "ss:vtn=0.5"], ["temp=27,125"])]
+        ['tt temp=27', 'tt temp=125', 'ss temp=27', 'ss temp=125']
+    """
+    found = [parse_corner(c) for c in corners] or [Corner("nominal")]
+    for text in lists:
+        name, equals, values = (p.strip() for p in text.partition("="))
+        options = [v.strip() for v in values.split(",") if v.strip()]
+        if not equals or not options:
+            raise ValueError(f"pvt={text!r}: expected PARAMETER=VALUE,VALUE,... or temp=...")
+        longer = []
+        for corner in found:
+            for option in options:
+                label = f"{name}={option}"
+                full = label if corner.name == "nominal" else f"{corner.name} {label}"
+                if name.lower() == "temp":
+                    longer.append(corner._replace(name=full, temperature=float(option)))
+                else:
+                    pair = (name.lower(), parse_number(option))
+                    longer.append(corner._replace(name=full, values=(*corner.values, pair)))
+        found = longer
+    names = [c.name for c in found]
+    twice = sorted({n for n in names if names.count(n) > 1})
+    if twice:
+        raise ValueError(f"corners={twice[0]!r}: expected once; two corners have this name")
+    return tuple(found)

@@ -40,6 +40,7 @@ SAME_MEANING = {
     "config": "the frozen settings of a part",
     "plots": "pictures of a part",
     "presets": "settings of a part by name",
+    "circuit": "a circuit as a search takes it",
     "reference": "a circuit in ngspice",
     "network": "neurons or filters and their connections",
     "geometry": "shapes, distances and overlaps",
@@ -47,13 +48,10 @@ SAME_MEANING = {
 }
 """Module names that may occur more than once, and the one thing they mean."""
 KNOWN_CIRCLES = {
-    ("failure.circuits.buck.converter", "failure.circuits.buck.reference"),
-    ("failure.circuits.ldo.reference", "failure.circuits.ldo.regulator"),
     ("fusion.lattice.grid", "fusion.lattice.shapes"),
 }
 KNOWN_LONG = {
     "detector_runs",
-    "find_failures",
     "sweep",
     "train_argate",
     "train_detector",

@@ -12,8 +12,8 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from failure.simulators.cache import Cache
 from failure.simulators.processes import Group, SimulatorError
+from failure.simulators.result_cache import Cache
 from failure.status import Status
 
 __all__ = ["Attempt", "Batch", "Result", "check_points"]

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from failure import CommandSimulator, FunctionSimulator, Status
-from failure.simulators.cache import Cache
+from failure.simulators.result_cache import Cache
 
 GOOD, FAILED, TIMED_OUT, NOT_FINITE = (
     Status.GOOD,

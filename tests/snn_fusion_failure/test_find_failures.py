@@ -73,8 +73,8 @@ def test_a_folder_with_a_run_is_refused_resumed_or_replaced(config):
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"circuit": "opamp"}, "unknown circuit 'opamp'"),
-        ({"spec": "gain"}, "unknown specification 'gain' of circuit 'toy'; known: margin"),
+        ({"circuit": "opamp"}, "circuit='opamp': expected one of"),
+        ({"spec": "gain"}, "spec='gain': expected a specification of 'toy', one of 'margin'"),
         ({"method": "annealing"}, "known methods: monte_carlo"),
         ({"task": "cube"}, "expected 'box' or 'ball'"),
         ({"verify": "spectre"}, "expected 'ngspice'"),

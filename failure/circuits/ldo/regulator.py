@@ -35,10 +35,8 @@ __all__ = [
     "QUANTITIES",
     "SPECS",
     "TIME",
-    "lowest",
     "solve_ldo",
     "time_grid",
-    "variation",
 ]
 
 KNEE = 1.0

@@ -7,7 +7,7 @@ from jaxtyping import Array, Float
 
 from failure.circuits.solver.system import System
 
-__all__ = ["Entries", "add_entry", "eliminate"]
+__all__ = ["eliminate"]
 
 Entries = dict[tuple[int, int], Array]
 

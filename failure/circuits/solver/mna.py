@@ -31,11 +31,6 @@ from failure.circuits.solver.values import Values, batch_size
 __all__ = [
     "GMIN",
     "Stamps",
-    "assemble",
-    "capacitance",
-    "conductance",
-    "keys",
-    "known_voltages",
     "residual",
     "source_current",
     "stamps",

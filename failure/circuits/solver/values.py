@@ -20,7 +20,7 @@ from failure.circuits.solver.netlist import (
 )
 from failure.circuits.solver.system import System
 
-__all__ = ["Values", "batch_size", "nominal_values"]
+__all__ = ["Values", "nominal_values"]
 
 
 class Values(NamedTuple):

@@ -260,7 +260,8 @@ def find_regions(
     if not np.all(nominal < 0.0):
         bad = np.flatnonzero(~(nominal < 0.0))
         raise ValueError(
-            f"the nominal circuit fails specifications {bad.tolist()}: nothing is rare"
+            f"nominal={nominal.tolist()}: expected violations below 0; the nominal circuit fails "
+            f"specifications {bad.tolist()}"
         )
     slopes = _first_slopes(archive, known_x, known_g, nominal)
     specs: list[int] = []

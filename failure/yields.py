@@ -39,7 +39,7 @@ class SpecYield(NamedTuple):
     verdict: str
 
 
-def normal_draws(key: Key[Array, ""], count: int, dim: int) -> Float[np.ndarray, "n d"]:
+def normal_draws(count: int, dim: int, *, key: Key[Array, ""]) -> Float[np.ndarray, "n d"]:
     """Normal samples of which a longer draw keeps the beginning: `x_i = N(fold_in(key, i))`."""
     with jax.enable_x64(True):
         one = jax.vmap(lambda i: jax.random.normal(jax.random.fold_in(key, i), (dim,)))
@@ -92,7 +92,7 @@ def line_sampling(
     from scipy.special import ndtr
 
     a = region.point / max(region.distance, 1e-300)
-    v = normal_draws(key, lines, len(a))
+    v = normal_draws(lines, len(a), key=key)
     v = v - (v @ a)[:, None] * a
     rate = max(float(region.slope @ a), 1e-12)
 
@@ -190,7 +190,7 @@ def mixture_sampling(
     else:
         shares = np.array([0.3, 0.7])
     # The first coordinate picks the part, so that more samples keep the earlier ones.
-    draws = normal_draws(key, n, dim + 1)
+    draws = normal_draws(n, dim + 1, key=key)
     from scipy.special import ndtr
 
     pick = np.searchsorted(np.cumsum(shares), ndtr(draws[:, 0]) * (1.0 - 1e-12))

@@ -20,7 +20,7 @@ _PRINTED = re.compile(
 
 
 def parse_number(text: str) -> float:
-    """A number with a SPICE suffix (`20u`, `4.7k`, `1meg`); letters after it are its unit.
+    """A number with a SPICE suffix (`4.7k` = 4700, `1meg` = 1e6); letters after it are its unit.
 
     Raises:
         ValueError: no number.

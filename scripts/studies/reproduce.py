@@ -24,10 +24,8 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
 from snn_fusion_failure.records import chapters
-from snn_fusion_failure.runs import fail, print_result, provenance, repository, write_json
+from snn_fusion_failure.runs import print_result, provenance, repository, run_command, write_json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -150,7 +148,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

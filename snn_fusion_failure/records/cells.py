@@ -15,7 +15,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records import markdown
+from snn_fusion_failure.records import comparability, markdown
+from snn_fusion_failure.records.intervals import interval, median_interval
 
 Row = dict[str, Any]
 Table = dict[str, Any]
@@ -35,6 +36,7 @@ class Printed:
         value: None where the source prints a dash.
         text: as printed.
         scale: factor from a row of record to this unit.
+        reason: why ours may not be held against it; '' where it may.
     """
 
     row: str
@@ -44,6 +46,7 @@ class Printed:
     value: float | None
     text: str
     scale: float = 1.0
+    reason: str = ""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -117,23 +120,10 @@ def printed_cells(number: str, table: Table) -> list[Printed]:
                 cells.append(_quantity(row, model, worst))
     # All models of one case and one score stand together.
     keys = dict.fromkeys((c.row, c.metric) for c in cells)
-    return [c for key in keys for c in cells if (c.row, c.metric) == key]
-
-
-def median_interval(values: Sequence[float]) -> tuple[float, float] | None:
-    """95 % interval of the median from order statistics; infinite values are allowed.
-
-    The k-th smallest and k-th largest value, with the largest k for which a binomial variable
-    of n trials and chance 1/2 falls below k with probability at most 2.5 %; None below six values.
-    """
-    ordered, n = sorted(values), len(values)
-    below, k = 0.0, 0
-    while True:
-        below += math.comb(n, k) / 2.0**n
-        if below > 0.025:
-            break
-        k += 1
-    return (ordered[k - 1], ordered[n - k]) if k else None
+    ordered = [c for key in keys for c in cells if (c.row, c.metric) == key]
+    names = ("row", "model", "metric")
+    why = [comparability.reason(number, {n: getattr(c, n) for n in names}) for c in ordered]
+    return [dataclasses.replace(c, reason=w) for c, w in zip(ordered, why, strict=True)]
 
 
 def measure(row: Row, origin: str, scale: float = 1.0) -> Measured:
@@ -157,12 +147,12 @@ def measure(row: Row, origin: str, scale: float = 1.0) -> Measured:
             origin,
             "median",
         )
-    mean, interval = row.get("mean"), row.get("ci95")
+    mean, ends = row.get("mean"), interval(row)
     return Measured(
         None if mean is None else scale * mean,
-        None if interval is None else (scale * interval[0], scale * interval[1]),
+        None if ends is None else (scale * ends[0], scale * ends[1]),
         n,
-        "" if interval is not None else "no interval",
+        "" if ends is not None else "no interval",
         origin,
     )
 
@@ -170,6 +160,8 @@ def measure(row: Row, origin: str, scale: float = 1.0) -> Measured:
 def verdict(printed: Printed, ours: Measured) -> str | None:
     """`better`, `within` or `worse` than the source; None where it may not be said."""
     source = printed.value
+    if printed.reason:
+        return None
     if source is None:
         # The source found no failure in its budget: later than any number.
         if printed.metric != "first_failure_hit":
@@ -237,10 +229,10 @@ def join(
 
 
 def tally(cells: Sequence[Cell], origin: str) -> dict[str, int]:
-    """How many cells of one origin are better, within, worse, not judged, and not run at all."""
-    counts = dict.fromkeys(("better", "within", "worse", "not judged", "not run"), 0)
+    """How many cells of one origin are better, within, worse, not comparable, and not run."""
+    counts = dict.fromkeys(("better", "within", "worse", "not comparable", "not run"), 0)
     for cell in cells:
         ours = [m for m in cell.measured if m.origin == origin]
-        name = (verdict(cell.printed, ours[0]) or "not judged") if ours else "not run"
+        name = (verdict(cell.printed, ours[0]) or "not comparable") if ours else "not run"
         counts[name] += 1
     return counts

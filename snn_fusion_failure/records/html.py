@@ -16,7 +16,7 @@ from typing import Any
 from snn_fusion_failure.records import markdown
 from snn_fusion_failure.records.cells import Cell, Measured, Printed, Row, verdict
 
-SIGNS = {"better": "✓", "within": "≈", "worse": "✗", "not judged": "–", "not run": "○"}
+SIGNS = {"better": "✓", "within": "≈", "worse": "✗", "not comparable": "–", "not run": "○"}
 
 SCORES = {
     "accuracy": ("accuracy", 1),
@@ -82,8 +82,6 @@ def score(metric: str, unit: str) -> str:
     """Name, unit and good direction of a score, as text."""
     name, direction = SCORES.get(metric, (metric.replace("_", " "), 0))
     unit = "" if unit in ("", "1") else f" [{unit}]"
-    if metric in markdown.INCOMPARABLE:
-        return f"{name}{unit}, {markdown.INCOMPARABLE[metric]}"
     return f"{name}{unit}" + {1: ", higher is better", -1: ", lower is better", 0: ""}[direction]
 
 
@@ -149,7 +147,7 @@ def cell_table(label: str, cells: Sequence[Cell]) -> str:
             line = _line(name, printed.text, None, "not run", printed.unit, False)
             rows.append(line)
         for index, ours in enumerate(cell.measured):
-            judged = verdict(printed, ours) or "not judged"
+            judged = verdict(printed, ours) or "not comparable"
             rows.append(_line(name, printed.text, ours, judged, printed.unit, index > 0))
     return scroll_table(label, HEADER, rows)
 

@@ -6,6 +6,8 @@ import math
 from collections.abc import Iterable, Sequence
 from typing import Any
 
+from snn_fusion_failure.records.intervals import interval
+
 Row = dict[str, Any]
 Table = dict[str, Any]
 
@@ -13,9 +15,12 @@ LOWER_IS_BETTER = frozenset({"n_mv", "path", "first_failure_hit"})
 """Metrics where a smaller number is the better one."""
 
 SPREAD_LINE = (
-    "Each cell: mean [95 % interval of Student's t over seeds] (n), then the source's printed "
-    "number and whether ours is *better*, *worse*, or the source's number lies *within* the "
-    "interval; with one seed there is no interval and the means are compared."
+    "Each cell: mean [95 % interval over seeds] (n), then the source's printed number and whether "
+    "ours is *better*, *worse*, or the source's number lies *within* the interval; with one seed "
+    "there is no interval and the means are compared. The interval is Student's; that of a share "
+    "(success rate, accuracy, AUROC) is Wilson's with the number of trials that gives the spread "
+    "over the seeds, so that it stays within 0 and 100 %. *Not comparable*: the two numbers do not "
+    "measure the same thing; the reason stands below the table's heading."
 )
 
 
@@ -35,26 +40,23 @@ def number(value: Any, unit: str = "") -> str:
 CENTRES = {"first_failure_hit": "median"}
 """Scores that are judged by another centre than their mean: the mean of the searches that found a
 failure says nothing of those that did not, while the median over all searches counts them."""
-INCOMPARABLE = {"worst_case": "not judged, since the circuit is another"}
-"""Scores that no mark is given for, and why."""
-
-
-def judged(metric: str, centre: str = "mean") -> bool:
-    """May this centre of a score be compared with the source's number?"""
-    return metric not in INCOMPARABLE and CENTRES.get(metric, "mean") == centre
 
 
 def mark(row: Row, centre: str = "mean") -> str | None:
-    """`better`, `within` or `worse` than the source's number; None without one.
+    """`better`, `within` or `worse` than the source's number; None without a comparable one.
 
     Args:
-        row: `metric`, `source`, `mean` and `ci95`.
+        row: `metric`, `source`, `mean` and `ci95` or `values`; `not_comparable` from
+            :func:`comparability.annotated`.
         centre: what `mean` is: the "mean" over seeds, as in the rows of record, or their "median".
     """
-    source, mean, interval = row.get("source"), row.get("mean"), row.get("ci95")
-    if not isinstance(source, int | float) or mean is None or not judged(row["metric"], centre):
+    source, mean = row.get("source"), row.get("mean")
+    if not isinstance(source, int | float) or mean is None or row.get("not_comparable"):
         return None
-    if interval is not None and interval[0] <= source <= interval[1]:
+    if CENTRES.get(row["metric"], "mean") != centre:
+        return None
+    ends = interval(row)
+    if ends is not None and ends[0] <= source <= ends[1]:
         return "within"
     if mean == source:
         return "within"
@@ -68,15 +70,14 @@ def cell(row: Row | None, with_unit: bool = False) -> str:
         return ""
     unit = row.get("unit", "")
     text = f"**{number(row.get('mean'), unit)}**"
-    interval = row.get("ci95")
-    if interval is not None:
-        text += f" [{number(interval[0], unit)}, {number(interval[1], unit)}]"
+    if (ends := interval(row)) is not None:
+        text += f" [{number(ends[0], unit)}, {number(ends[1], unit)}]"
     if with_unit and unit not in ("", "1"):
         text += f" {unit}"
     if "n" in row:
         text += f" ({row['n']})"
     if "source" in row:
-        verdict = mark(row)
+        verdict = "not comparable" if row.get("not_comparable") else mark(row)
         text += f"; source {number(row['source'], unit)}" + (f", *{verdict}*" if verdict else "")
     return text
 
@@ -170,13 +171,19 @@ def tally(rows: Iterable[Row]) -> dict[str, int]:
 
 
 def tally_line(rows: Sequence[Row]) -> str:
-    """One sentence: how many cells are better, within, worse."""
+    """How many cells are better, within, worse, and which are not comparable, and why."""
     counts = tally(rows)
     total = sum(counts.values())
-    if not total:
+    why: dict[str, int] = {}
+    for row in rows:
+        if "source" in row and row.get("not_comparable"):
+            why[row["not_comparable"]] = why.get(row["not_comparable"], 0) + 1
+    if not total and not why:
         return "The source prints no number for these cells."
     listed = ", ".join(f"{n} {name}" for name, n in counts.items())
-    return f"Against the source's {total} printed numbers: {listed}."
+    parts = [f"Against {total} of the source's printed numbers: {listed}."] if total else []
+    parts += [f"Not comparable, {n} cells: {reason}." for reason, n in why.items()]
+    return " ".join(parts)
 
 
 def comparisons(study: Table, table: Table | None) -> str:

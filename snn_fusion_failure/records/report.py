@@ -7,7 +7,7 @@ from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records import cells, chapters, html
+from snn_fusion_failure.records import cells, chapters, comparability, html
 from snn_fusion_failure.records.figures import gallery
 from snn_fusion_failure.records.html import escape, tag
 from snn_fusion_failure.runs import provenance, repository, write_text
@@ -21,14 +21,16 @@ CHAPTERS = {
 RULE = (
     "“Within” means that the source's number lies in our 95 % interval; “better” and “worse” that "
     "it lies outside, on the bad or on the good side of ours as the heading of the score says. "
-    "The interval is Student's t interval of the mean over n independent seeds. With one seed "
-    "there is none, and the two numbers are compared as they are.",
+    "The interval is Student's t interval of the mean over n independent seeds; that of a share "
+    "(success rate, accuracy, AUROC) is Wilson's with the number of trials that gives the spread "
+    "over the seeds, so that it stays within 0 and 100 %. With one seed there is none, and the two "
+    "numbers are compared as they are.",
     "The first failure is different, since some searches find none: ours is the median over the "
     "searches, where a search without a failure counts as later than all others, with the "
     "interval of the median from order statistics (six searches or more).",
-    "“Not judged”: the two numbers do not measure the same thing; the heading says why. “Not "
-    "run”: there is no number of ours. Nothing on this page was typed in: ours come from the "
-    "JSON files named below, the source's from results/source_tables.json.",
+    "“Not comparable”: the two numbers do not measure the same thing; the words above the table "
+    "say why. “Not run”: there is no number of ours. Nothing on this page was typed in: ours come "
+    "from the JSON files named below, the source's from results/source_tables.json.",
 )
 
 NOTES = {
@@ -62,6 +64,8 @@ def _section(number: str, source: cells.Table, held: Sequence[tuple[str, cells.T
         parts.append(tag("p", html.mark("not run"), f" {escape(reason)}"))
     if number in NOTES:
         parts.append(tag("p", escape(NOTES[number]), klass="soft"))
+    for why in comparability.reasons(number):
+        parts.append(tag("p", html.mark("not comparable"), f" {escape(why)}.", klass="soft"))
     label = f"Table {number}"
     parts.append(html.cell_table(label, found))
     parts.append(html.more_table(f"{label}, further measurements", more))
@@ -70,7 +74,7 @@ def _section(number: str, source: cells.Table, held: Sequence[tuple[str, cells.T
 
 def _overview(sources: dict[str, Any], held: dict[str, list[tuple[str, cells.Table]]]) -> str:
     """One line for each table: how many cells are better, within, worse, not run."""
-    names = ("better", "within", "worse", "not judged", "not run")
+    names = ("better", "within", "worse", "not comparable", "not run")
     lines = []
     total = {origin: dict.fromkeys(names, 0) for origin in ("quick run", "record")}
     for number, source in sources.items():

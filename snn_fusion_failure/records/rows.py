@@ -7,6 +7,7 @@ from collections.abc import Iterable, Sequence
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.records.intervals import interval
 from snn_fusion_failure.runs.files import write_json
 from snn_fusion_failure.runs.provenance import provenance
 
@@ -27,10 +28,11 @@ def record_table(
 ) -> None:
     """Write or update a table of record; rows are replaced by (row, model, metric), others stay.
 
-    Every row keeps the command and the commit that made it.
+    Every row keeps the command and the commit that made it; the interval of a share is one that
+    stays within 0 and 100 %.
     """
     made = provenance()
-    rows = [{"command": made["command"], "git": made["git"], **row} for row in rows]
+    rows = [{"command": made["command"], "git": made["git"], **row, **_ends(row)} for row in rows]
     held: list[dict[str, Any]] = []
     if path.exists():
         held = json.loads(path.read_text(encoding="utf-8"))["rows"]
@@ -44,6 +46,10 @@ def record_table(
         path,
         {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows},
     )
+
+
+def _ends(row: dict[str, Any]) -> dict[str, Any]:
+    return {"ci95": list(found)} if (found := interval(row)) is not None else {}
 
 
 def record_comparisons(

@@ -8,9 +8,9 @@ from typing import Any
 
 import pytest
 
-from snn_fusion_failure.records import markdown
+from snn_fusion_failure.records import comparability, intervals, markdown, pages
 from snn_fusion_failure.records.rows import summarize
-from snn_fusion_failure.runs import write_json
+from snn_fusion_failure.runs import repository, write_json
 from tests._scripts import load_script
 
 render_results = load_script("studies/render_results")
@@ -91,9 +91,8 @@ def _line(text: str, *parts: str) -> str:
         ("accuracy", 97.0, None, 97.0, "within"),
         ("n_mv", 40.0, [38.0, 42.0], 46.0, "better"),
         ("n_mv", 50.0, [48.0, 52.0], 46.0, "worse"),
-        # A mean over the searches that found a failure, and another circuit's volts: no peers.
+        # A mean over the searches that found a failure.
         ("first_failure_hit", 120.0, None, 206, None),
-        ("worst_case", 120.0, [110.0, 130.0], 206, None),
     ],
 )
 def test_marks(metric: str, mean: float, interval: Any, source: float, verdict: str | None) -> None:
@@ -113,15 +112,56 @@ def test_no_mark_without_a_number_of_the_source() -> None:
     assert markdown.mark({"metric": "accuracy", "mean": None, "source": 2.0}) is None
 
 
+def test_no_mark_where_something_else_is_measured() -> None:
+    rows = [
+        {"row": "Scenario 1", "model": "S4", "metric": metric, "mean": 40.0, "source": 46, "n": 9}
+        for metric in ("n_mv", "sr_testing")
+    ]
+    moves, successes = comparability.annotated("2.3", rows)
+    assert markdown.mark(moves) is None and markdown.mark(successes) == "worse"
+    assert markdown.cell(moves).endswith("source 46, *not comparable*")
+    line = markdown.tally_line([moves, successes])
+    assert line.startswith("Against 1 of the source's printed numbers: 0 better, 0 within, 1 worse")
+    assert "Not comparable, 1 cells: " in line and "drawings of the source's maps are lost" in line
+    assert comparability.annotated("3.1", rows) == rows
+
+
+def test_intervals_of_shares_stay_inside() -> None:
+    """Student's interval of these success rates ends at 102 %."""
+    row = {"metric": "sr_testing", "unit": "%", "values": [100.0] * 7 + [90.0]}
+    low, high = intervals.interval(row | {"ci95": [95.8, 102.0]})
+    assert 80.0 < low < 95.8 and 98.75 < high < 100.0
+    # In the middle it is Student's.
+    middle = [52.0, 48.0, 51.0, 49.0, 50.0]
+    student = summarize(middle)["ci95"]
+    assert intervals.share_interval(middle, 100.0) == pytest.approx(student, abs=0.05)
+    # All have succeeded: as many trials as runs; a share of another kind has a point.
+    assert intervals.share_interval([100.0] * 20, 100.0, successes=True)[0] == pytest.approx(
+        83.89, abs=0.01
+    )
+    assert intervals.share_interval([1.0, 1.0], 1.0) == (1.0, 1.0)
+    assert intervals.interval({"metric": "n_mv", "unit": "steps", "ci95": [1, 120]}) == (1, 120)
+
+
+def test_nothing_of_record_is_shown_beyond_its_bounds() -> None:
+    for path in (*pages.files(repository.RESULTS)[0], *pages.files(repository.RESULTS)[1]):
+        for row in pages.load(path).get("rows", []):
+            top = intervals.bound(row["metric"], row.get("unit")) if "metric" in row else None
+            ends = intervals.interval(row) if top else None
+            if ends is not None:
+                assert 0.0 <= ends[0] <= row["mean"] + 1e-9, (path.name, row["metric"])
+                assert row["mean"] - 1e-9 <= ends[1] <= top, (path.name, row["metric"])
+
+
 def test_page(config: render_results.Config) -> None:
     config.readme.write_text("# top\n<!-- results:begin -->\nold\n<!-- results:end -->\nbottom\n")
     made = render_results.main(config)
     page = (config.docs / "results.md").read_text()
     assert made["figure"] is None  # no single runs at hand
-    assert "3 printed numbers: 1 better, 1 within, 1 worse" in page
+    assert "Against 3 of the source's printed numbers: 1 better, 1 within, 1 worse." in page
     clean = _line(page, "| clean | **90.10**")
-    interval = TABLE["rows"][3]["ci95"]
-    assert f"**90.10** [{interval[0]:.2f}, {interval[1]:.2f}] (2); source 94.06, *worse*" in clean
+    low, high = intervals.share_interval([90.0, 90.2], 100.0)
+    assert f"**90.10** [{low:.2f}, {high:.2f}] (2); source 94.06, *worse*" in clean
     assert "source 96.71, *within*" in clean
     assert clean.index("94.06") < clean.index("96.71") < clean.index("**98.00** (1)")
     assert page.index("| clean |") < page.index("| n_clean=1 uniform |")
@@ -140,11 +180,11 @@ def test_page(config: render_results.Config) -> None:
     assert _line(page, "| S4 |").startswith("| S4 | **50.5** steps (3) | **70.00** % (3) |")
 
     readme = config.readme.read_text()
-    assert readme.startswith("# top\n<!-- results:begin -->\nAll cells")
+    assert readme.startswith("# top\n<!-- results:begin -->\nThe source prints 216 numbers. 3 of")
     assert readme.endswith("<!-- results:end -->\nbottom\n")
     assert "old" not in readme
-    assert "96.71 | within |" in _line(readme, "| 3.1 | clean | argate_l")
-    assert "baseline" not in readme
+    # Of the 55 cells of Tables 3.1 to 3.3; two seeds leave a wide interval.
+    assert "| Fusion, HAR (3.1 to 3.3) | · | 2 | 1 | · | 52 |" in readme
 
 
 def test_rendering_twice_changes_nothing(config: render_results.Config) -> None:

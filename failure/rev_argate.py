@@ -176,7 +176,7 @@ def loss(
     mean_weights = jnp.sum(mask[:, None] * weights, 0) / count
     auxiliary = jnp.sum(mean_weights * aux_losses)
     seen = jax.lax.stop_gradient(aux_losses)[None]
-    targets = apply_targets(params.targets, config.targets, seen)
+    targets = apply_targets(config.targets, params.targets, seen)
     fixed = loss_targets(seen, "softmax", config.tau)
     pull = jnp.sum(mask * jnp.sum((weights - targets) ** 2, 1)) / count
     anchor = jnp.sum((targets - fixed) ** 2)
@@ -216,7 +216,7 @@ def fit(
             network=update.network._replace(step=jnp.zeros_like(update.network.step))
         )
         params = optax.apply_updates(params, update)
-        params = params._replace(targets=project_targets(params.targets, config.targets))
+        params = params._replace(targets=project_targets(config.targets, params.targets))
         return (params, state), main
 
     (params, _), losses = jax.lax.scan(

@@ -7,9 +7,10 @@ import dataclasses
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from fusion.lattice import deep_lattice
+from fusion.lattice.checks import refusal, require_count, require_range
 from fusion.lattice.deep_lattice import DeepLatticeConfig, DeepLatticeParams
 
 __all__ = [
@@ -38,6 +39,16 @@ class TargetConfig:
     n_hidden_keypoints: int = 4
     lattice_size: int = 3
 
+    def __post_init__(self) -> None:
+        """Refuse sizes and ranges that mean nothing."""
+        for name in ("n_keypoints", "n_hidden_keypoints", "lattice_size"):
+            require_count(name, getattr(self, name), 2)
+        require_range("loss_range", self.loss_range)
+        if None in self.loss_range:
+            raise refusal(
+                "loss_range", self.loss_range, "two numbers", "give the smallest and largest loss"
+            )
+
 
 def lattice_config(config: TargetConfig, n_sensors: int) -> DeepLatticeConfig:
     """The calibrator-linear-calibrator-lattice chain of one f_k; its own loss is input 0.
@@ -62,22 +73,22 @@ def _own_first(n_sensors: int) -> np.ndarray:
     return np.asarray(rows)
 
 
-def init_targets(key: Array, config: TargetConfig, n_sensors: int) -> DeepLatticeParams:
+def init_targets(key: Key[Array, ""], config: TargetConfig, n_sensors: int) -> DeepLatticeParams:
     """Parameters of the K networks, stacked on a leading axis."""
     keys = jax.random.split(key, n_sensors)
     return jax.vmap(deep_lattice.init, (0, None))(keys, lattice_config(config, n_sensors))
 
 
 def apply_targets(
-    params: DeepLatticeParams, config: TargetConfig, losses: Float[Array, "b k"]
+    config: TargetConfig, params: DeepLatticeParams, losses: Float[Array, "b k"]
 ) -> Float[Array, "b k"]:
     r"""Fusion-weight targets of each example.
 
     .. math:: t_k = f_k(L_k, L_{j \neq k}), \qquad \partial f_k / \partial L_k \leq 0
 
     Args:
-        params: of the K networks.
         config: static.
+        params: of the K networks.
         losses: cross entropy of each auxiliary path, per example.
 
     Returns:
@@ -88,18 +99,18 @@ def apply_targets(
     """
     k = losses.shape[-1]
     inputs = jnp.transpose(losses[:, _own_first(k)], (1, 0, 2))
-    apply = jax.vmap(deep_lattice.apply, (0, None, 0))
-    return apply(params, lattice_config(config, k), inputs).T
+    apply = jax.vmap(deep_lattice.apply, (None, 0, 0))
+    return apply(lattice_config(config, k), params, inputs).T
 
 
-def project_targets(params: DeepLatticeParams, config: TargetConfig) -> DeepLatticeParams:
+def project_targets(config: TargetConfig, params: DeepLatticeParams) -> DeepLatticeParams:
     """The nearest parameters (stage by stage) with which every f_k is monotone and bounded."""
     k = params.lattices[0].shape[0]
-    return jax.vmap(deep_lattice.project, (0, None))(params, lattice_config(config, k))
+    return jax.vmap(deep_lattice.project, (None, 0))(lattice_config(config, k), params)
 
 
-def check_targets(params: DeepLatticeParams, config: TargetConfig) -> Float[Array, ""]:
+def check_targets(config: TargetConfig, params: DeepLatticeParams) -> Float[Array, ""]:
     """Largest violation of a constraint in any f_k; 0 after `project_targets`."""
     k = params.lattices[0].shape[0]
-    check = jax.vmap(deep_lattice.check, (0, None))
-    return jnp.max(check(params, lattice_config(config, k)))
+    check = jax.vmap(deep_lattice.check, (None, 0))
+    return jnp.max(check(lattice_config(config, k), params))

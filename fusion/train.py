@@ -137,7 +137,7 @@ def batch_loss(
         aux_losses = cross_entropy(aux_logits, labels)
         if terms.learned_targets:
             seen = jax.lax.stop_gradient(aux_losses) if terms.stop_targets else aux_losses
-            targets = apply_targets(params["targets"], model.targets, seen)
+            targets = apply_targets(model.targets, params["targets"], seen)
     loss = argate_loss(terms, hyper.loss, out.logits, y, out.weights, aux_losses, targets)
     return loss.total, (loss, out)
 
@@ -182,7 +182,7 @@ def train_step(
             lambda p, u, d=decay: p - rate * (u + d * p), tree, updates[part]
         )
     if "targets" in params:
-        params["targets"] = project_targets(params["targets"], model.targets)
+        params["targets"] = project_targets(model.targets, params["targets"])
     n_failed = jnp.sum(failed)
     metrics = EpochMetrics(
         loss=terms,

@@ -47,9 +47,7 @@ SAME_MEANING = {
     "__main__": "what `python -m` runs",
 }
 """Module names that may occur more than once, and the one thing they mean."""
-KNOWN_CIRCLES = {
-    ("fusion.lattice.grid", "fusion.lattice.shapes"),
-}
+KNOWN_CIRCLES: set[tuple[str, str]] = set()
 KNOWN_LONG = {
     "detector_runs",
     "sweep",

@@ -10,6 +10,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
+from fusion.lattice.checks import (
+    refusal,
+    require_count,
+    require_key,
+    require_range,
+    require_static,
+)
 from fusion.lattice.projections import (
     MARGIN,
     dykstra,
@@ -52,16 +59,17 @@ class CategoricalConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes, ranges and orders that mean nothing."""
-        if self.n_categories < 1:
-            raise ValueError(f"n_categories is {self.n_categories}; expected at least 1")
-        low, high = self.output_range
-        if low is not None and high is not None and not low < high:
-            raise ValueError(f"output_range is {self.output_range}; expected low < high")
+        require_static(self)
+        require_count("n_categories", self.n_categories)
+        require_count("n_iterations", self.n_iterations)
+        require_range("output_range", self.output_range)
         missing = self.missing_value
         if missing is not None and 0 <= missing < self.n_categories:
-            raise ValueError(
-                f"missing_value is {missing}, which is a category; expected a value outside "
-                f"0..{self.n_categories - 1}, for example -1"
+            raise refusal(
+                "missing_value",
+                missing,
+                f"a number outside 0..{self.n_categories - 1}, since it is a category",
+                "use -1",
             )
         _ = self.closure
 
@@ -81,6 +89,7 @@ def init(key: Key[Array, ""], config: CategoricalConfig) -> CategoricalParams:
     Returns:
         CategoricalParams; feasible.
     """
+    require_key(key)
     low, high = config.output_range
     if low is None:
         low = 0.0 if high is None else high - 1.0
@@ -88,19 +97,19 @@ def init(key: Key[Array, ""], config: CategoricalConfig) -> CategoricalParams:
         high = low + 1.0
     outputs = jax.random.uniform(key, (config.n_categories,), minval=low, maxval=high)
     missing = None if config.missing_value is None else jnp.asarray(0.5 * (low + high), jnp.float32)
-    return project(CategoricalParams(outputs, missing), config)
+    return project(config, CategoricalParams(outputs, missing))
 
 
 def apply(
-    params: CategoricalParams, config: CategoricalConfig, x: Int[Array, "*batch"]
+    config: CategoricalConfig, params: CategoricalParams, x: Int[Array, "*batch"]
 ) -> Float[Array, "*batch"]:
     r"""The output of each category.
 
     .. math:: c(x) = \sum_i \theta_i \, [x = i]
 
     Args:
-        params: of the calibrator.
         config: of the calibrator.
+        params: of the calibrator.
         x: categories. One that is neither known nor `missing_value` gives NaN.
 
     Returns:
@@ -108,7 +117,7 @@ def apply(
 
     Example:
         >>> params = CategoricalParams(jnp.array([0.0, 10.0, 20.0]))
-        >>> apply(params, CategoricalConfig(3), jnp.array([2, 0])).tolist()
+        >>> apply(CategoricalConfig(3), params, jnp.array([2, 0])).tolist()
         [20.0, 0.0]
     """
     categories = jnp.arange(config.n_categories, dtype=x.dtype)
@@ -122,13 +131,13 @@ def apply(
 
 
 def project(
-    params: CategoricalParams, config: CategoricalConfig, *, margin: float = MARGIN
+    config: CategoricalConfig, params: CategoricalParams, *, margin: float = MARGIN
 ) -> CategoricalParams:
     """The nearest outputs that satisfy order and bounds, by Dykstra and an exact last step.
 
     Args:
-        params: of the calibrator.
         config: of the calibrator.
+        params: of the calibrator.
         margin: slack to leave, in float32 epsilons of the largest output; 0 for none.
 
     Returns:
@@ -143,14 +152,14 @@ def project(
     sets = pair_projections(closure)
     if sets:
         y = repair_order(dykstra(y, sets, config.n_iterations), closure)
-    y = _clip(y, config, slack, float(depth.max())) + lift
+    y = _clip(config, y, slack, float(depth.max())) + lift
     missing = params.missing
     if missing is not None:
-        missing = _clip(missing, config, slack, 0.0)
+        missing = _clip(config, missing, slack, 0.0)
     return CategoricalParams(y, missing)
 
 
-def _clip(y: Array, config: CategoricalConfig, slack: Array, depth: float) -> Array:
+def _clip(config: CategoricalConfig, y: Array, slack: Array, depth: float) -> Array:
     low, high = config.output_range
     if low is not None:
         y = jnp.maximum(y, low + slack)
@@ -159,7 +168,7 @@ def _clip(y: Array, config: CategoricalConfig, slack: Array, depth: float) -> Ar
     return y
 
 
-def check(params: CategoricalParams, config: CategoricalConfig) -> Float[Array, ""]:
+def check(config: CategoricalConfig, params: CategoricalParams) -> Float[Array, ""]:
     """Largest violation of order and bounds; 0 where all hold."""
     y = params.outputs
     gap = jnp.where(config.closure, y[:, None] - y[None, :], 0.0)

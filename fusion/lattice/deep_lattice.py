@@ -15,7 +15,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from fusion.lattice import grid, linear, pwl
+from fusion.lattice import lattice_layer, linear, pwl
+from fusion.lattice.checks import (
+    refusal,
+    require_count,
+    require_key,
+    require_signs,
+    require_static,
+)
+from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
 from fusion.lattice.projections import MARGIN
 
 __all__ = ["DeepLatticeConfig", "DeepLatticeParams", "apply", "check", "init", "project"]
@@ -27,7 +35,7 @@ class DeepLatticeParams(NamedTuple):
     inputs: pwl.PWLParams
     embedding: linear.LinearParams
     hidden: pwl.PWLParams
-    lattices: grid.LatticeParams
+    lattices: LatticeParams
 
 
 @dataclasses.dataclass(frozen=True)
@@ -71,30 +79,31 @@ class DeepLatticeConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes that mean nothing; the stages check the rest."""
-        if self.n_lattices < 1 or self.embedding_dim < 1:
-            raise ValueError(
-                f"n_lattices is {self.n_lattices} and embedding_dim is {self.embedding_dim}; "
-                "expected 1 or more"
-            )
+        require_static(self)
+        for name in ("n_inputs", "n_lattices", "embedding_dim"):
+            require_count(name, getattr(self, name))
+        require_count("lattice_size", self.lattice_size, 2)
+        require_signs("monotonicity", self.monotonicity, self.n_inputs)
         signs = self.signs
-        if signs.shape != (self.n_inputs,):
-            raise ValueError(
-                f"monotonicity has {signs.size} entries; expected one for each of "
-                f"{self.n_inputs} inputs"
-            )
         given = self.n_monotone
         if given is not None:
             least = 1 if signs.any() else 0
             most = self.embedding_dim if signs.any() else 0
             if not least <= given <= most:
-                raise ValueError(
-                    f"n_monotone is {given}; expected {least}..{most} of the "
-                    f"{self.embedding_dim} embedding outputs for monotonicity {signs.tolist()}"
+                raise refusal(
+                    "n_monotone",
+                    given,
+                    f"{least}..{most} of the {self.embedding_dim} embedding outputs for "
+                    f"monotonicity {signs.tolist()}",
+                    "leave n_monotone out for half of them",
                 )
             if given < self.embedding_dim and signs.all():
-                raise ValueError(
-                    f"n_monotone is {given} of {self.embedding_dim}, but all inputs are monotone: "
-                    "the other embedding outputs would have no input; leave n_monotone out"
+                raise refusal(
+                    "n_monotone",
+                    given,
+                    f"{self.embedding_dim}, since all inputs are monotone and the other embedding "
+                    "outputs would have no input",
+                    "leave n_monotone out",
                 )
         _ = self.inputs, self.embedding, self.hidden, self.lattice
 
@@ -155,9 +164,9 @@ class DeepLatticeConfig:
         )
 
     @property
-    def lattice(self) -> grid.LatticeConfig:
+    def lattice(self) -> LatticeConfig:
         """Each of the lattices."""
-        return grid.LatticeConfig(
+        return LatticeConfig(
             (self.lattice_size,) * self.embedding_dim,
             monotonicity=self.axis_signs,
             output_range=self.output_range,
@@ -180,23 +189,24 @@ def init(key: Key[Array, ""], config: DeepLatticeConfig) -> DeepLatticeParams:
         >>> config = DeepLatticeConfig(3, monotonicity=(-1, 0, 0), input_range=(0.0, 4.0))
         >>> params = jax.jit(init, static_argnums=1)(jax.random.key(0), config)
         >>> x = jnp.array([[0.5, 1.0, 1.0], [3.0, 1.0, 1.0]])
-        >>> y = jax.jit(apply, static_argnums=1)(params, config, x)
+        >>> y = jax.jit(apply, static_argnums=0)(config, params, x)
         >>> bool(y[1] < y[0])
         True
     """
+    require_key(key)
     keys = jax.random.split(key, 4)
     return DeepLatticeParams(
         pwl.init(keys[0], config.inputs),
         linear.init(keys[1], config.embedding),
         pwl.init(keys[2], config.hidden),
-        jax.vmap(lambda k: grid.init(k, config.lattice))(
+        jax.vmap(lambda k: lattice_layer.init(k, config.lattice))(
             jax.random.split(keys[3], config.n_lattices)
         ),
     )
 
 
 def apply(
-    params: DeepLatticeParams, config: DeepLatticeConfig, x: Float[Array, "*batch n_inputs"]
+    config: DeepLatticeConfig, params: DeepLatticeParams, x: Float[Array, "*batch n_inputs"]
 ) -> Float[Array, "*batch"]:
     r"""The network's output.
 
@@ -206,8 +216,8 @@ def apply(
     the `hidden` calibrators; :math:`L` is `n_lattices`.
 
     Args:
-        params: of the network.
         config: of the network.
+        params: of the network.
         x: inputs.
 
     Returns:
@@ -216,26 +226,28 @@ def apply(
     Source: You et al. (2017), Deep lattice networks and partial monotonic functions; the layout
     of the dissertation's Figure 3.4.
     """
-    h = pwl.apply(params.inputs, config.inputs, x)
-    h = linear.apply(params.embedding, config.embedding, h)
-    h = pwl.apply(params.hidden, config.hidden, h)
+    h = pwl.apply(config.inputs, params.inputs, x)
+    h = linear.apply(config.embedding, params.embedding, h)
+    h = pwl.apply(config.hidden, params.hidden, h)
     h = h.reshape(*x.shape[:-1], config.n_lattices, config.embedding_dim)
     lattice = config.lattice
     if config.n_lattices == 1:
         only = jax.tree.map(lambda a: a[0], params.lattices)
-        return grid.apply(only, lattice, h[..., 0, :])
-    outputs = jax.vmap(lambda p, z: grid.apply(p, lattice, z), (0, -2), -1)(params.lattices, h)
+        return lattice_layer.apply(lattice, only, h[..., 0, :])
+    outputs = jax.vmap(lambda p, z: lattice_layer.apply(lattice, p, z), (0, -2), -1)(
+        params.lattices, h
+    )
     return jnp.mean(outputs, axis=-1)
 
 
 def project(
-    params: DeepLatticeParams, config: DeepLatticeConfig, *, margin: float = MARGIN
+    config: DeepLatticeConfig, params: DeepLatticeParams, *, margin: float = MARGIN
 ) -> DeepLatticeParams:
     """Each stage projected onto its own constraints, which together make the network monotone.
 
     Args:
-        params: of the network. For K networks: `jax.vmap(project, (0, None))`.
         config: of the network.
+        params: of the network. For K networks: `jax.vmap(project, (None, 0))`.
         margin: slack to leave, in float32 epsilons of the largest parameter of each stage.
 
     Returns:
@@ -243,20 +255,20 @@ def project(
     """
     lattice = config.lattice
     return DeepLatticeParams(
-        pwl.project(params.inputs, config.inputs, margin=margin),
-        linear.project(params.embedding, config.embedding, margin=margin),
-        pwl.project(params.hidden, config.hidden, margin=margin),
-        jax.vmap(lambda p: grid.project(p, lattice, margin=margin))(params.lattices),
+        pwl.project(config.inputs, params.inputs, margin=margin),
+        linear.project(config.embedding, params.embedding, margin=margin),
+        pwl.project(config.hidden, params.hidden, margin=margin),
+        jax.vmap(lambda p: lattice_layer.project(lattice, p, margin=margin))(params.lattices),
     )
 
 
-def check(params: DeepLatticeParams, config: DeepLatticeConfig) -> Float[Array, ""]:
+def check(config: DeepLatticeConfig, params: DeepLatticeParams) -> Float[Array, ""]:
     """Largest violation in any stage; 0 where the network is monotone and bounded as asked."""
-    lattices = jax.vmap(lambda p: grid.check(p, config.lattice))(params.lattices)
+    lattices = jax.vmap(lambda p: lattice_layer.check(config.lattice, p))(params.lattices)
     return jnp.maximum(
         jnp.maximum(
-            pwl.check(params.inputs, config.inputs),
-            linear.check(params.embedding, config.embedding),
+            pwl.check(config.inputs, params.inputs),
+            linear.check(config.embedding, params.embedding),
         ),
-        jnp.maximum(pwl.check(params.hidden, config.hidden), jnp.max(lattices)),
+        jnp.maximum(pwl.check(config.hidden, params.hidden), jnp.max(lattices)),
     )

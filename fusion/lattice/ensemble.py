@@ -10,10 +10,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from fusion.lattice import grid
-from fusion.lattice.inputs import require_width
+from fusion.lattice import lattice_layer
+from fusion.lattice.checks import (
+    refusal,
+    require_count,
+    require_key,
+    require_signs,
+    require_static,
+    require_width,
+)
+from fusion.lattice.constraints import project_vertices, violation
+from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
 from fusion.lattice.projections import MARGIN, tilt
-from fusion.lattice.shapes import project_vertices, violation
 
 __all__ = ["EnsembleConfig", "apply", "check", "init", "project", "random_features"]
 
@@ -40,11 +48,13 @@ def random_features(
     balanced, so that no input is left out.
     """
     if not 1 <= rank <= n_inputs:
-        raise ValueError(f"rank is {rank}; expected 1..{n_inputs} (the number of inputs)")
+        raise refusal("rank", rank, f"1..{n_inputs}, the number of inputs", "lower the rank")
     if n_lattices * rank < n_inputs:
-        raise ValueError(
-            f"{n_lattices} lattices of rank {rank} have {n_lattices * rank} places for {n_inputs} "
-            "inputs; use more lattices or a higher rank"
+        raise refusal(
+            "n_lattices",
+            n_lattices,
+            f"{-(-n_inputs // rank)} or more: {n_inputs} inputs need a place at rank {rank}",
+            "use more lattices or a higher rank",
         )
     rng = np.random.default_rng(seed)
     used = np.zeros(n_inputs)
@@ -81,30 +91,31 @@ class EnsembleConfig:
 
     def __post_init__(self) -> None:
         """Refuse subsets and directions that mean nothing; `LatticeConfig` checks the rest."""
-        ranks = {len(subset) for subset in self.features}
-        if len(ranks) != 1:
-            raise ValueError(
-                f"features hold subsets of {sorted(ranks)} inputs; expected at least one subset "
-                "and the same number of inputs in each"
+        require_static(self)
+        require_count("n_inputs", self.n_inputs)
+        require_count("lattice_size", self.lattice_size, 2)
+        if len({len(subset) for subset in self.features}) != 1:
+            raise refusal(
+                "features",
+                self.features,
+                "one or more subsets with the same number of inputs in each",
+                "make them with random_features",
             )
         for subset in self.features:
             if len(set(subset)) != len(subset) or not all(0 <= i < self.n_inputs for i in subset):
-                raise ValueError(
-                    f"features hold {subset}; expected different inputs of 0..{self.n_inputs - 1}"
+                raise refusal(
+                    "features",
+                    subset,
+                    f"different inputs of 0..{self.n_inputs - 1}",
+                    "make them with random_features",
                 )
-        given = self.monotonicity
-        if given is not None and (
-            len(given) != self.n_inputs or any(s not in (-1, 0, 1) for s in given)
-        ):
-            raise ValueError(
-                f"monotonicity is {given}; expected -1, 0 or 1 for each of {self.n_inputs} inputs"
-            )
+        require_signs("monotonicity", self.monotonicity, self.n_inputs)
         _ = self.lattice
 
     @property
-    def lattice(self) -> grid.LatticeConfig:
+    def lattice(self) -> LatticeConfig:
         """Size, bounds and interpolation of each lattice."""
-        return grid.LatticeConfig(
+        return LatticeConfig(
             (self.lattice_size,) * len(self.features[0]),
             output_range=self.output_range,
             interpolation=self.interpolation,
@@ -118,8 +129,8 @@ class EnsembleConfig:
         return signs[np.asarray(self.features)]
 
 
-def init(key: Key[Array, ""], config: EnsembleConfig) -> grid.LatticeParams:
-    """Planes, as in `grid.init`, with the directions of each lattice's inputs.
+def init(key: Key[Array, ""], config: EnsembleConfig) -> LatticeParams:
+    """Planes, as in `lattice_layer.init`, with the directions of each lattice's inputs.
 
     Args:
         key: PRNG key.
@@ -127,17 +138,21 @@ def init(key: Key[Array, ""], config: EnsembleConfig) -> grid.LatticeParams:
 
     Returns:
         LatticeParams with `vertices` `[n_lattices, *sizes]`; feasible.
+
+    Raises:
+        ValueError: a legacy key.
     """
+    require_key(key)
     signs = config.signs
     lattices = []
     for row, lattice_key in zip(signs, jax.random.split(key, len(signs)), strict=True):
         lattice = dataclasses.replace(config.lattice, monotonicity=tuple(int(s) for s in row))
-        lattices.append(grid.init(lattice_key, lattice).vertices)
-    return grid.LatticeParams(jnp.stack(lattices))
+        lattices.append(lattice_layer.init(lattice_key, lattice).vertices)
+    return LatticeParams(jnp.stack(lattices))
 
 
 def apply(
-    params: grid.LatticeParams, config: EnsembleConfig, x: Float[Array, "*batch n_inputs"]
+    config: EnsembleConfig, params: LatticeParams, x: Float[Array, "*batch n_inputs"]
 ) -> Float[Array, "*batch"]:
     r"""Mean of the lattices' outputs.
 
@@ -146,8 +161,8 @@ def apply(
     Symbols: :math:`S_l` is `config.features[l]`; :math:`L` is the number of lattices.
 
     Args:
-        params: of the ensemble.
         config: of the ensemble.
+        params: of the ensemble.
         x: inputs.
 
     Returns:
@@ -156,18 +171,18 @@ def apply(
     require_width(x, config.n_inputs, "ensemble.apply")
     chosen = x[..., np.asarray(config.features)]
     lattice = config.lattice
-    each = jax.vmap(lambda p, z: grid.apply(p, lattice, z), (0, -2), -1)
+    each = jax.vmap(lambda p, z: lattice_layer.apply(lattice, p, z), (0, -2), -1)
     return jnp.mean(each(params, chosen), axis=-1)
 
 
 def project(
-    params: grid.LatticeParams, config: EnsembleConfig, *, margin: float = MARGIN
-) -> grid.LatticeParams:
+    config: EnsembleConfig, params: LatticeParams, *, margin: float = MARGIN
+) -> LatticeParams:
     """Each lattice projected onto its constraints, all of them in one vmapped program.
 
     Args:
-        params: of the ensemble.
         config: of the ensemble.
+        params: of the ensemble.
         margin: slack to leave, in float32 epsilons of each lattice's largest vertex.
 
     Returns:
@@ -177,13 +192,13 @@ def project(
     signs = config.signs
     if np.all(signs == signs[0]):
         row = signs[0]
-        each = jax.vmap(lambda v: project_vertices(v, row, lattice, tilt(v, margin)))
-        return grid.LatticeParams(each(params.vertices))
-    mixed = jax.vmap(lambda v, row: project_vertices(v, row, lattice, tilt(v, margin)))
-    return grid.LatticeParams(mixed(params.vertices, jnp.asarray(signs)))
+        each = jax.vmap(lambda v: project_vertices(lattice, row, v, tilt(v, margin)))
+        return LatticeParams(each(params.vertices))
+    mixed = jax.vmap(lambda v, row: project_vertices(lattice, row, v, tilt(v, margin)))
+    return LatticeParams(mixed(params.vertices, jnp.asarray(signs)))
 
 
-def check(params: grid.LatticeParams, config: EnsembleConfig) -> Float[Array, ""]:
+def check(config: EnsembleConfig, params: LatticeParams) -> Float[Array, ""]:
     """Largest violation in any lattice; 0 where all constraints hold."""
-    each = jax.vmap(lambda v, row: violation(v, row, config.lattice))
+    each = jax.vmap(lambda v, row: violation(config.lattice, row, v))
     return jnp.max(each(params.vertices, jnp.asarray(config.signs)))

@@ -11,7 +11,13 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from fusion.lattice.inputs import require_width
+from fusion.lattice.checks import (
+    refusal,
+    require_count,
+    require_key,
+    require_static,
+    require_width,
+)
 from fusion.lattice.projections import (
     MARGIN,
     dykstra,
@@ -70,48 +76,62 @@ class LinearConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes, directions and pairs that mean nothing."""
-        if self.n_inputs < 1 or self.n_outputs < 1:
-            raise ValueError(
-                f"n_inputs is {self.n_inputs} and n_outputs is {self.n_outputs}; expected 1 or more"
-            )
+        require_static(self)
+        for name in ("n_inputs", "n_outputs", "n_iterations"):
+            require_count(name, getattr(self, name))
         shape = (self.n_outputs, self.n_inputs)
         if self.monotonicity is not None:
             signs = np.asarray(self.monotonicity)
             if signs.shape not in (shape, shape[1:]) or not np.isin(signs, (-1, 0, 1)).all():
-                raise ValueError(
-                    f"monotonicity is {self.monotonicity}; expected -1, 0 or 1 for each of "
-                    f"{self.n_inputs} inputs, or such a tuple for each of {self.n_outputs} outputs"
+                raise refusal(
+                    "monotonicity",
+                    self.monotonicity,
+                    f"-1, 0 or 1 for each of {self.n_inputs} inputs, or such a tuple for each of "
+                    f"{self.n_outputs} outputs",
+                    "write 0 for free",
                 )
         if self.connected is not None:
             links = np.asarray(self.connected)
             if links.shape != shape or not np.isin(links, (0, 1)).all() or not links.any(1).all():
-                raise ValueError(
-                    f"connected has shape {links.shape}; expected {shape} of 0 and 1 with at "
-                    "least one input for each output"
+                raise refusal(
+                    "connected",
+                    self.connected,
+                    f"{shape[0]} tuples of {shape[1]} entries 0 or 1, at least one 1 in each",
+                    "leave it out to connect all",
                 )
         if self.range_dominance and (
             self.input_range is None or np.shape(self.input_range) != (self.n_inputs, 2)
         ):
-            raise ValueError(
-                f"range_dominance needs input_range with a (low, high) pair for each of "
-                f"{self.n_inputs} inputs; got {self.input_range}"
+            raise refusal(
+                "input_range",
+                self.input_range,
+                f"a (low, high) pair for each of {self.n_inputs} inputs, which range_dominance "
+                "needs",
+                "give the ranges of the inputs",
             )
         signs = self.signs
         for strong, weak in (*self.dominance, *self.range_dominance):
             if not (0 <= strong < self.n_inputs and 0 <= weak < self.n_inputs):
-                raise ValueError(
-                    f"dominance pair {(strong, weak)} names an input outside 0..{self.n_inputs - 1}"
+                raise refusal(
+                    "dominance",
+                    (strong, weak),
+                    f"two inputs of 0..{self.n_inputs - 1}",
+                    "name inputs by their position",
                 )
             if np.any(signs[:, strong] != signs[:, weak]) or np.any(signs[:, strong] == 0):
-                raise ValueError(
-                    f"dominance pair {(strong, weak)} joins inputs of monotonicity "
-                    f"{signs[:, strong].tolist()} and {signs[:, weak].tolist()}; both must be +1 "
-                    "or both -1"
+                raise refusal(
+                    "dominance",
+                    (strong, weak),
+                    "two inputs of monotonicity +1, or both -1, not "
+                    f"{signs[:, strong].tolist()} and {signs[:, weak].tolist()}",
+                    "change monotonicity, or drop the pair",
                 )
             if not np.array_equal(self.links[:, strong], self.links[:, weak]):
-                raise ValueError(
-                    f"dominance pair {(strong, weak)}: one input is connected to an output that "
-                    "the other is not; connect both or neither"
+                raise refusal(
+                    "dominance",
+                    (strong, weak),
+                    "two inputs that are connected to the same outputs",
+                    "connect both or neither",
                 )
         _dominance(self)
 
@@ -141,6 +161,7 @@ def init(key: Key[Array, ""], config: LinearConfig) -> LinearParams:
     Returns:
         LinearParams; feasible.
     """
+    require_key(key)
     signs, links = config.signs, config.links
     sizes_key, signs_key = jax.random.split(key)
     sizes = jax.random.uniform(sizes_key, signs.shape, minval=0.5, maxval=1.5)
@@ -154,19 +175,19 @@ def init(key: Key[Array, ""], config: LinearConfig) -> LinearParams:
         weights = weights + part / total * jnp.asarray(share, sizes.dtype)
     weights = weights * jnp.where(signs == 0, coin, jnp.asarray(signs, sizes.dtype))
     bias = jnp.zeros(config.n_outputs, weights.dtype) if config.bias else None
-    return project(LinearParams(weights, bias), config)
+    return project(config, LinearParams(weights, bias))
 
 
 def apply(
-    params: LinearParams, config: LinearConfig, x: Float[Array, "*batch n_inputs"]
+    config: LinearConfig, params: LinearParams, x: Float[Array, "*batch n_inputs"]
 ) -> Float[Array, "*batch n_outputs"]:
     r"""Weighted sums of the inputs.
 
     .. math:: y_o = b_o + \sum_i w_{oi} x_i
 
     Args:
-        params: of the layer.
         config: of the layer.
+        params: of the layer.
         x: inputs.
 
     Returns:
@@ -192,18 +213,20 @@ def _dominance(config: LinearConfig) -> tuple[np.ndarray, np.ndarray] | None:
     width = np.ones(config.n_inputs)
     if config.range_dominance:
         if config.dominance:
-            raise ValueError(
-                "dominance and range_dominance are both given; use one of them (with equal "
-                "ranges they mean the same)"
+            raise refusal(
+                "range_dominance",
+                config.range_dominance,
+                "() beside dominance",
+                "use one of the two (with equal ranges they mean the same)",
             )
         width = np.diff(np.asarray(config.input_range, np.float64), axis=-1)[:, 0]
         if not np.all(width > 0):
-            raise ValueError(f"input_range is {config.input_range}; expected low < high")
+            raise refusal("input_range", config.input_range, "low < high", "exchange the two")
     pairs = [(weak, strong) for strong, weak in (*config.dominance, *config.range_dominance)]
     return width, order_closure(pairs, config.n_inputs)
 
 
-def project(params: LinearParams, config: LinearConfig, *, margin: float = MARGIN) -> LinearParams:
+def project(config: LinearConfig, params: LinearParams, *, margin: float = MARGIN) -> LinearParams:
     r"""The nearest weights that satisfy the constraints.
 
     Signs are clipped; dominance pairs are half-spaces, solved together with the signs by
@@ -212,8 +235,8 @@ def project(params: LinearParams, config: LinearConfig, *, margin: float = MARGI
     because the set :math:`\sum_i |w_i| = 1` is not convex then.
 
     Args:
-        params: of the layer.
         config: of the layer.
+        params: of the layer.
         margin: slack that dominance keeps, in float32 epsilons of the largest weight.
 
     Returns:
@@ -267,7 +290,7 @@ def _simplex(v: Array, links: np.ndarray) -> Array:
     return jnp.maximum(low - jnp.max(threshold, axis=-1, keepdims=True), 0.0)
 
 
-def check(params: LinearParams, config: LinearConfig) -> Float[Array, ""]:
+def check(config: LinearConfig, params: LinearParams) -> Float[Array, ""]:
     """Largest violation of signs, dominance, connections and norm; 0 where all hold.
 
     The norm counts as 1 within rounding: a few epsilons for each weight.

@@ -9,6 +9,8 @@ import jax
 import jax.numpy as jnp
 import optax
 
+from fusion.lattice.checks import refusal
+
 __all__ = ["with_projection"]
 
 
@@ -32,7 +34,7 @@ def with_projection(
     Args:
         optimizer: any optax transformation that yields updates to add.
         project: from parameters to feasible parameters of the same structure, for example
-            `lambda p: deep_lattice.project(p, config)`, vmapped where parameters are.
+            `lambda p: deep_lattice.project(config, p)`, vmapped where parameters are.
 
     Returns:
         The optax transformation; `update` needs `params`.
@@ -56,8 +58,11 @@ def with_projection(
         **extra: Any,
     ) -> tuple[optax.Updates, optax.OptState]:
         if params is None:
-            raise ValueError(
-                "with_projection got params=None; call optimizer.update(grads, state, params)"
+            raise refusal(
+                "params",
+                None,
+                "the parameters, which are projected",
+                "call optimizer.update(grads, state, params)",
             )
         updates, state = inner.update(updates, state, params, **extra)
         moved = project(optax.apply_updates(params, updates))

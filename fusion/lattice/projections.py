@@ -14,6 +14,8 @@ import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from fusion.lattice.checks import refusal
+
 __all__ = [
     "MARGIN",
     "dykstra",
@@ -144,9 +146,11 @@ def order_closure(pairs: Sequence[tuple[int, int]], n: int) -> np.ndarray:
     closure = np.eye(n, dtype=bool)
     for low, high in pairs:
         if not (0 <= low < n and 0 <= high < n) or low == high:
-            raise ValueError(
-                f"order pair {(low, high)} is not valid: expected two different elements of "
-                f"0..{n - 1}, the smaller one first"
+            raise refusal(
+                "order",
+                (low, high),
+                f"two different elements of 0..{n - 1}, the smaller one first",
+                "name elements by their position",
             )
         closure[low, high] = True
     for middle in range(n):
@@ -154,7 +158,12 @@ def order_closure(pairs: Sequence[tuple[int, int]], n: int) -> np.ndarray:
     circle = np.argwhere(np.triu(closure & closure.T, k=1))
     if len(circle):
         i, j = (int(v) for v in circle[0])
-        raise ValueError(f"order pairs {tuple(pairs)} run in a circle through {i} and {j}")
+        raise refusal(
+            "order",
+            tuple(pairs),
+            f"pairs without a circle, such as the one through {i} and {j}",
+            "drop a pair",
+        )
     return closure
 
 

@@ -11,7 +11,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from fusion.lattice.inputs import require_width
+from fusion.lattice.checks import (
+    refusal,
+    require_count,
+    require_key,
+    require_range,
+    require_signs,
+    require_static,
+    require_width,
+)
 from fusion.lattice.projections import MARGIN, isotonic, tilt
 
 __all__ = ["PWLConfig", "PWLParams", "apply", "check", "init", "keypoints", "project"]
@@ -59,35 +67,36 @@ class PWLConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes, ranges and directions that mean nothing."""
-        if self.n_inputs < 1:
-            raise ValueError(f"n_inputs is {self.n_inputs}; expected at least 1")
-        if self.n_keypoints < 2:
-            raise ValueError(f"n_keypoints is {self.n_keypoints}; expected at least 2")
-        signs = self.monotonicity if isinstance(self.monotonicity, tuple) else (self.monotonicity,)
-        if len(signs) not in (1, self.n_inputs) or any(s not in (-1, 0, 1) for s in signs):
-            raise ValueError(
-                f"monotonicity is {self.monotonicity!r}; expected -1, 0 or 1, or a tuple with one "
-                f"of these for each of {self.n_inputs} inputs"
-            )
-        low, high = self.output_range
-        if low is not None and high is not None and not low < high:
-            raise ValueError(f"output_range is {self.output_range}; expected low < high")
+        require_static(self)
+        require_count("n_inputs", self.n_inputs)
+        require_count("n_keypoints", self.n_keypoints, 2)
+        given = self.monotonicity
+        require_signs(
+            "monotonicity", given if isinstance(given, tuple) else (given,) * self.n_inputs,
+            self.n_inputs,
+        )  # fmt: skip
+        require_range("output_range", self.output_range)
         shape = (self.n_inputs, self.n_keypoints)
         if self.keypoints is not None:
             positions = np.asarray(self.keypoints, np.float64)
             if positions.shape != shape or not np.all(np.diff(positions) > 0):
-                raise ValueError(
-                    f"keypoints has shape {positions.shape}; expected {shape} with positions that "
-                    "increase strictly (drop repeated quantiles)"
+                raise refusal(
+                    "keypoints",
+                    self.keypoints,
+                    f"{shape[0]} tuples of {shape[1]} positions that increase strictly",
+                    "drop repeated quantiles",
                 )
         else:
             ranges = np.asarray(self.input_range, np.float64)
             if ranges.shape not in ((2,), (self.n_inputs, 2)) or not np.all(
                 np.diff(ranges, axis=-1) > 0
             ):
-                raise ValueError(
-                    f"input_range is {self.input_range}; expected (low, high) with low < high, or "
-                    f"one such pair for each of {self.n_inputs} inputs"
+                raise refusal(
+                    "input_range",
+                    self.input_range,
+                    "(low, high) with low < high, or one such pair for each of "
+                    f"{self.n_inputs} inputs",
+                    "take them from the smallest and largest values of the data",
                 )
 
     @property
@@ -108,13 +117,14 @@ def init(key: Key[Array, ""], config: PWLConfig) -> PWLParams:
     """Straight lines across the output range (the identity where a bound is missing).
 
     Args:
-        key: not used, calibrators start alike; taken so that all layers are called the same way.
+        key: decides nothing, calibrators start alike; taken so that all layers are called the
+            same way.
         config: the layer.
 
     Returns:
         PWLParams; feasible.
     """
-    del key
+    require_key(key)
     start, signs = config.start, config.signs
     low, high = config.output_range
     fraction = (start - start[:, :1]) / (start[:, -1:] - start[:, :1])
@@ -133,17 +143,17 @@ def init(key: Key[Array, ""], config: PWLConfig) -> PWLParams:
         spacing = jnp.asarray(np.log(np.diff(start) / width), jnp.float32)
     if config.missing_value is not None:
         missing = jnp.asarray(outputs.mean(axis=-1), jnp.float32)
-    return project(PWLParams(jnp.asarray(outputs, jnp.float32), spacing, missing), config)
+    return project(config, PWLParams(jnp.asarray(outputs, jnp.float32), spacing, missing))
 
 
 def keypoints(
-    params: PWLParams, config: PWLConfig
+    config: PWLConfig, params: PWLParams
 ) -> tuple[Float[Array, "n_inputs n_keypoints"], Float[Array, "n_inputs n_keypoints"]]:
     """Positions and outputs of the keypoints: the points one would plot.
 
     Example:
         >>> config = PWLConfig(1, n_keypoints=3, output_range=(0.0, 4.0))
-        >>> x, y = keypoints(init(jax.random.key(0), config), config)
+        >>> x, y = keypoints(config, init(jax.random.key(0), config))
         >>> x.tolist()
         [[0.0, 0.5, 1.0]]
     """
@@ -156,7 +166,7 @@ def keypoints(
 
 
 def apply(
-    params: PWLParams, config: PWLConfig, x: Float[Array, "*batch n_inputs"]
+    config: PWLConfig, params: PWLParams, x: Float[Array, "*batch n_inputs"]
 ) -> Float[Array, "*batch n_inputs"]:
     r"""Each input through its own piecewise-linear function.
 
@@ -168,8 +178,8 @@ def apply(
     non-decreasing terms, so rounding cannot break monotonicity.
 
     Args:
-        params: of the layer.
         config: of the layer.
+        params: of the layer.
         x: inputs; outside the keypoints the function is constant.
 
     Returns:
@@ -181,7 +191,7 @@ def apply(
     Source: Gupta et al. (2016), Monotonic calibrated interpolated look-up tables, section 3.1.
     """
     require_width(x, config.n_inputs, "pwl.apply")
-    where, outputs = keypoints(params, config)
+    where, outputs = keypoints(config, params)
     lead = (1,) * (x.ndim - 1)
     left = where[:, :-1].reshape(*lead, config.n_inputs, -1)
     inverse = (1.0 / (where[:, 1:] - where[:, :-1])).reshape(left.shape)
@@ -189,7 +199,7 @@ def apply(
     inside = x
     if params.missing is not None:
         # A NaN must not reach the ramps: it would poison their gradient even where not selected.
-        absent = _absent(x, config)
+        absent = _absent(config, x)
         inside = jnp.where(absent, jnp.zeros_like(x), x)
     ramps = jnp.clip((inside[..., None] - left) * inverse, 0.0, 1.0)
     y = outputs[:, 0].reshape(*lead, -1) + jnp.sum(ramps * rise, axis=-1)
@@ -198,22 +208,25 @@ def apply(
     return y
 
 
-def _absent(x: Array, config: PWLConfig) -> Array:
+def _absent(config: PWLConfig, x: Array) -> Array:
     value = config.missing_value
     if value is None:
-        raise ValueError("params hold outputs for missing inputs, but config.missing_value is None")
+        raise refusal(
+            "missing_value", value, "a number or nan, since params hold outputs for missing inputs",
+            "use the configuration that the parameters were made with",
+        )  # fmt: skip
     return jnp.isnan(x) if math.isnan(value) else x == value
 
 
-def project(params: PWLParams, config: PWLConfig, *, margin: float = MARGIN) -> PWLParams:
+def project(config: PWLConfig, params: PWLParams, *, margin: float = MARGIN) -> PWLParams:
     r"""The nearest calibrators that satisfy monotonicity and bounds (Euclidean, exact).
 
     Isotonic regression, then clipping: the projection onto monotone sequences within constant
     bounds is the clipped projection onto monotone sequences.
 
     Args:
-        params: of the layer.
         config: of the layer.
+        params: of the layer.
         margin: slack to leave, in float32 epsilons of the largest output; 0 for none.
 
     Returns:
@@ -236,14 +249,14 @@ def project(params: PWLParams, config: PWLConfig, *, margin: float = MARGIN) -> 
         if not bound.all():
             ordered = jnp.where(np.broadcast_to(bound != 0, part.shape), ordered, part)
         y = jnp.concatenate([y[: rows.start], ordered, y[rows.stop :]])
-    y = _clip(y, config, slack, jnp.asarray(last * np.abs(signs), y.dtype)) + lift
+    y = _clip(config, y, slack, jnp.asarray(last * np.abs(signs), y.dtype)) + lift
     missing = params.missing
     if missing is not None:
-        missing = _clip(missing, config, slack, None)
+        missing = _clip(config, missing, slack, None)
     return PWLParams(y, params.spacing, missing)
 
 
-def _clip(y: Array, config: PWLConfig, slack: Array, ranks: Array | None) -> Array:
+def _clip(config: PWLConfig, y: Array, slack: Array, ranks: Array | None) -> Array:
     low, high = config.output_range
     if low is not None:
         y = jnp.maximum(y, low + slack)
@@ -253,7 +266,7 @@ def _clip(y: Array, config: PWLConfig, slack: Array, ranks: Array | None) -> Arr
     return y
 
 
-def check(params: PWLParams, config: PWLConfig) -> Float[Array, ""]:
+def check(config: PWLConfig, params: PWLParams) -> Float[Array, ""]:
     """Largest violation of monotonicity and bounds; 0 where all constraints hold."""
     y = params.outputs
     signs = jnp.asarray(config.signs[:, None], y.dtype)

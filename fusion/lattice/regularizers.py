@@ -7,7 +7,8 @@ import itertools
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from fusion.lattice.grid import LatticeParams
+from fusion.lattice.checks import refusal
+from fusion.lattice.lattice_config import LatticeParams
 from fusion.lattice.pwl import PWLParams
 
 __all__ = [
@@ -71,7 +72,9 @@ def lattice_laplacian(
     first = l1 if isinstance(l1, tuple) else (l1,) * v.ndim
     second = l2 if isinstance(l2, tuple) else (l2,) * v.ndim
     if len(first) != v.ndim or len(second) != v.ndim:
-        raise ValueError(f"l1 is {l1} and l2 is {l2}; expected a float or {v.ndim} of them each")
+        raise refusal(
+            "(l1, l2)", (l1, l2), f"a float or {v.ndim} of them each", "give one for each input"
+        )
     total = jnp.zeros((), v.dtype)
     for axis, (a, b) in enumerate(zip(first, second, strict=True)):
         total = total + _penalty(jnp.diff(v, axis=axis), a, b)

@@ -38,27 +38,27 @@ def _models() -> dict[str, tuple[Any, Any, Any, tuple[int, ...]]]:
     import jax
     import numpy as np
 
-    from fusion.lattice import DeepLatticeConfig, LatticeConfig, deep_lattice, grid
+    from fusion.lattice import DeepLatticeConfig, LatticeConfig, deep_lattice, lattice_layer
 
     models: dict[str, tuple[Any, Any, Any, tuple[int, ...]]] = {}
     for batch in (128, 1024, 4096):
         lattice = LatticeConfig((5, 5, 3, 3), (1, 1, 0, 0), output_range=(0.0, 1.0))
         models[f"lattice_5x5x3x3_batch_{batch}"] = (
-            lambda key, c=lattice: grid.init(key, c),
-            lambda p, x, c=lattice: grid.apply(p, c, 4.0 * x),
-            lambda p, c=lattice: grid.project(p, c),
+            lambda key, c=lattice: lattice_layer.init(key, c),
+            lambda p, x, c=lattice: lattice_layer.apply(c, p, 4.0 * x),
+            lambda p, c=lattice: lattice_layer.project(c, p),
             (batch, 4),
         )
     # The source's use: one network for each of nine sensors, falling in its own loss.
     k = 9
     deep = DeepLatticeConfig(k, (-1,) + (0,) * (k - 1))
     order = np.stack([np.r_[i, np.delete(np.arange(k), i)] for i in range(k)])
-    each = jax.vmap(lambda p, x: deep_lattice.apply(p, deep, x), (0, -2), -1)
+    each = jax.vmap(lambda p, x: deep_lattice.apply(deep, p, x), (0, -2), -1)
     for batch in (16, 128):
         models[f"deep_lattice_9_networks_batch_{batch}"] = (
             lambda key: jax.vmap(deep_lattice.init, (0, None))(jax.random.split(key, k), deep),
             lambda p, x: each(p, x[..., order]),
-            lambda p: jax.vmap(deep_lattice.project, (0, None))(p, deep),
+            lambda p: jax.vmap(deep_lattice.project, (None, 0))(deep, p),
             (batch, k),
         )
     return models

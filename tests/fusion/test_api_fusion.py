@@ -18,7 +18,8 @@ from fusion.lattice import (
     categorical,
     deep_lattice,
     ensemble,
-    grid,
+    lattice_config,
+    lattice_layer,
     linear,
     projections,
     pwl,
@@ -31,7 +32,7 @@ LOSS = losses.LossParams(*(np.float32(v) for v in (1.0, 0.5, 0.7, 0.2)))
 TARGETS = targets.TargetConfig(n_keypoints=3, n_hidden_keypoints=3, lattice_size=2)
 PWL = pwl.PWLConfig(2, 4, monotonicity=1, output_range=(0.0, 1.0))
 LINEAR = linear.LinearConfig(3, 2, monotonicity=(1, 0, -1), normalized=True)
-LATTICE = grid.LatticeConfig((3, 2), monotonicity=(1, 0), output_range=(0.0, 1.0))
+LATTICE = lattice_config.LatticeConfig((3, 2), monotonicity=(1, 0), output_range=(0.0, 1.0))
 CATEGORIES = categorical.CategoricalConfig(4, order=((0, 1), (1, 3)))
 ENSEMBLE = ensemble.EnsembleConfig(3, ((0, 1), (1, 2)), monotonicity=(1, 0, 0))
 DEEP = deep_lattice.DeepLatticeConfig(2, monotonicity=(-1, 0), n_keypoints=3, n_hidden_keypoints=3)
@@ -82,19 +83,19 @@ def layer_cases(name: str, module: Any, config: Any, inputs: Any) -> list[Case]:
     return [
         Case(
             f"lattice.{name}.apply",
-            lambda p, x: module.apply(p, config, x),
+            lambda p, x: module.apply(config, p, x),
             layer(config, module, inputs),
         ),
         Case(
             f"lattice.{name}.project",
-            lambda p: module.project(p, config),
+            lambda p: module.project(config, p),
             layer(config, module),
             (),
             "a projection; the optimizer applies it after the step",
         ),
         Case(
             f"lattice.{name}.check",
-            lambda p: module.check(p, config),
+            lambda p: module.check(config, p),
             layer(config, module),
             (),
             "a test of feasibility",
@@ -189,7 +190,7 @@ CASES = [
     ),
     Case(
         "targets.apply_targets",
-        lambda x: targets.apply_targets(_target_params(), TARGETS, x) ** 2,
+        lambda x: targets.apply_targets(TARGETS, _target_params(), x) ** 2,
         lambda rng: f32(rng.uniform(0.1, 3.0, (4, 2))),
     ),
     Case(
@@ -227,7 +228,7 @@ CASES = [
     ),
     *layer_cases("pwl", pwl, PWL, unit(5, 2)),
     *layer_cases("linear", linear, LINEAR, unit(5, 3)),
-    *layer_cases("grid", grid, LATTICE, unit(5, 2)),
+    *layer_cases("lattice_layer", lattice_layer, LATTICE, unit(5, 2)),
     *layer_cases("ensemble", ensemble, ENSEMBLE, unit(5, 3)),
     *layer_cases("deep_lattice", deep_lattice, DEEP, unit(5, 2)),
     *layer_cases(
@@ -243,8 +244,8 @@ CASES = [
             (regularizers.pwl_laplacian, pwl, PWL),
             (regularizers.pwl_hessian, pwl, PWL),
             (regularizers.pwl_wrinkle, pwl, PWL),
-            (regularizers.lattice_laplacian, grid, LATTICE),
-            (regularizers.lattice_torsion, grid, LATTICE),
+            (regularizers.lattice_laplacian, lattice_layer, LATTICE),
+            (regularizers.lattice_torsion, lattice_layer, LATTICE),
         )
     ),
     Case("lattice.projections.isotonic", lambda v: projections.isotonic(v) ** 2, normal((2, 5))),

@@ -342,7 +342,7 @@ def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) ->
     assert all(np.isfinite(list(row.values())).all() for row in whole.history)
     assert whole.history[0]["rpn_positives"] > 0 and whole.history[0]["positives"] > 0
     assert 0 < whole.history[-1]["weight_camera"] < 1
-    assert float(check_targets(whole.state.params["targets"], TINY.targets)) == 0.0
+    assert float(check_targets(TINY.targets, whole.state.params["targets"])) == 0.0
 
     def stop(step: int, row: dict[str, float]) -> None:
         if step == 4:

@@ -11,16 +11,16 @@ import pytest
 from fusion.lattice import (
     CategoricalConfig,
     DeepLatticeConfig,
-    DeepLatticeParams,
     LatticeConfig,
     PWLConfig,
     categorical,
     deep_lattice,
-    grid,
-    plots,
+    lattice_layer,
     pwl,
     with_projection,
 )
+from fusion.lattice.deep_lattice import DeepLatticeParams
+from fusion.lattice.plots import plot_calibrator, plot_categorical, plot_lattice_slice
 
 # K losses in, K targets out: network k has its own loss first, the others after it.
 K = 4
@@ -29,7 +29,7 @@ ORDER = np.stack([np.r_[k, np.delete(np.arange(K), k)] for k in range(K)])
 
 
 def _targets(params: DeepLatticeParams, losses: jax.Array) -> jax.Array:
-    each = jax.vmap(lambda p, x: deep_lattice.apply(p, CONFIG, x), (0, -2), -1)
+    each = jax.vmap(lambda p, x: deep_lattice.apply(CONFIG, p, x), (0, -2), -1)
     return each(params, losses[..., ORDER])
 
 
@@ -40,7 +40,7 @@ def networks() -> DeepLatticeParams:
     leaves, tree = jax.tree.flatten(params)
     rng = np.random.default_rng(1)
     moved = [a + jnp.asarray(0.3 * rng.normal(size=a.shape), a.dtype) for a in leaves]
-    project = jax.jit(jax.vmap(lambda p: deep_lattice.project(p, CONFIG)))
+    project = jax.jit(jax.vmap(lambda p: deep_lattice.project(CONFIG, p)))
     return project(jax.tree.unflatten(tree, moved))
 
 
@@ -73,22 +73,22 @@ def test_output_stays_within_bounds(networks: DeepLatticeParams) -> None:
 def test_vmapped_networks_equal_a_loop(networks: DeepLatticeParams) -> None:
     losses = jax.random.uniform(jax.random.key(3), (6, K), maxval=4.0)
     together = jax.jit(_targets)(networks, losses)
-    apply = jax.jit(lambda p, x: deep_lattice.apply(p, CONFIG, x))
+    apply = jax.jit(lambda p, x: deep_lattice.apply(CONFIG, p, x))
     for k in range(K):
         one = jax.tree.map(lambda a, k=k: a[k], networks)
         alone = apply(one, losses[:, ORDER[k]])
         np.testing.assert_allclose(together[:, k], alone, atol=1e-6)
-    checks = jax.jit(jax.vmap(lambda p: deep_lattice.check(p, CONFIG)))(networks)
+    checks = jax.jit(jax.vmap(lambda p: deep_lattice.check(CONFIG, p)))(networks)
     np.testing.assert_array_equal(checks, np.zeros(K))
 
 
 def test_any_batch_shape_gives_the_same_numbers(networks: DeepLatticeParams) -> None:
     one = jax.tree.map(lambda a: a[0], networks)
     x = jax.random.uniform(jax.random.key(4), (2, 3, K), maxval=4.0)
-    apply = jax.jit(deep_lattice.apply, static_argnums=1)
-    full = apply(one, CONFIG, x)
+    apply = jax.jit(deep_lattice.apply, static_argnums=0)
+    full = apply(CONFIG, one, x)
     assert full.shape == (2, 3)
-    np.testing.assert_allclose(full[1, 2], apply(one, CONFIG, x[1, 2]), atol=1e-6)
+    np.testing.assert_allclose(full[1, 2], apply(CONFIG, one, x[1, 2]), atol=1e-6)
 
 
 @pytest.mark.parametrize(
@@ -109,7 +109,7 @@ def test_networks_learn_softmax_targets_and_stay_monotone() -> None:
     """Mean squared error of a constant is 0.036 here; the shape is learned in 400 steps."""
     keys = jax.random.split(jax.random.key(0), K)
     params = jax.jit(jax.vmap(lambda key: deep_lattice.init(key, CONFIG)))(keys)
-    project = jax.vmap(lambda p: deep_lattice.project(p, CONFIG))
+    project = jax.vmap(lambda p: deep_lattice.project(CONFIG, p))
     optimizer = with_projection(optax.adam(0.02), project)
 
     def loss_fn(params: DeepLatticeParams, losses: jax.Array) -> jax.Array:
@@ -121,7 +121,7 @@ def test_networks_learn_softmax_targets_and_stay_monotone() -> None:
         loss, grads = jax.value_and_grad(loss_fn)(params, losses)
         updates, state = optimizer.update(grads, state, params)
         params = optax.apply_updates(params, updates)
-        worst = jnp.max(jax.vmap(lambda p: deep_lattice.check(p, CONFIG))(params))
+        worst = jnp.max(jax.vmap(lambda p: deep_lattice.check(CONFIG, p))(params))
         return (params, state), (loss, worst)
 
     @jax.jit
@@ -138,18 +138,23 @@ def test_pictures_show_the_parameters() -> None:
     import matplotlib.pyplot as plt
 
     config = PWLConfig(2, 4, missing_value=-1.0)
-    ax = plots.plot_calibrator(pwl.init(jax.random.key(0), config), config, 1, name="speed")
+    calibrators = pwl.init(jax.random.key(0), config)
+    figure = plot_calibrator(config, calibrators, 1, name="speed")
+    (ax,) = figure.axes
     np.testing.assert_allclose(ax.lines[0].get_xdata(), np.linspace(0, 1, 4), atol=1e-6)
     assert ax.get_xlabel() == "speed"
     categories = CategoricalConfig(3, missing_value=9)
-    ax = plots.plot_categorical(categorical.init(jax.random.key(0), categories), categories)
-    assert len(ax.patches) == 4
+    side = plt.figure().subplots(1, 2)
+    figure = plot_categorical(
+        categories, categorical.init(jax.random.key(0), categories), ax=side[1]
+    )
+    assert figure is side[1].figure and len(side[1].patches) == 4 and not side[0].patches
     lattice = LatticeConfig((2, 3, 2))
-    params = grid.init(jax.random.key(0), lattice)
-    ax = plots.plot_lattice_slice(params, lattice, (1, 2), (1.0, 0.0, 0.0), resolution=5)
-    assert ax.get_xlim() == (0.0, 2.0)
+    params = lattice_layer.init(jax.random.key(0), lattice)
+    figure = plot_lattice_slice(lattice, params, (1, 2), (1.0, 0.0, 0.0), resolution=5)
+    assert figure.axes[0].get_xlim() == (0.0, 2.0)
     with pytest.raises(ValueError, match="two different inputs"):
-        plots.plot_lattice_slice(params, lattice, (1, 1))
-    with pytest.raises(ValueError, match="index is 2"):
-        plots.plot_calibrator(pwl.init(jax.random.key(0), config), config, 2)
+        plot_lattice_slice(lattice, params, (1, 1))
+    with pytest.raises(ValueError, match="index=2: expected"):
+        plot_calibrator(config, calibrators, 2)
     plt.close("all")

@@ -16,29 +16,41 @@ import pytest
 
 from fusion.lattice import (
     CategoricalConfig,
-    CategoricalParams,
     DeepLatticeConfig,
-    DeepLatticeParams,
     EnsembleConfig,
     LatticeConfig,
-    LatticeParams,
     LinearConfig,
-    LinearParams,
     PWLConfig,
-    PWLParams,
     categorical,
     deep_lattice,
     ensemble,
-    grid,
     keypoints,
+    lattice_layer,
     linear,
     pwl,
     random_features,
     regularizers,
     vertices,
 )
+from fusion.lattice.categorical import CategoricalParams
+from fusion.lattice.checks import require_key
+from fusion.lattice.deep_lattice import DeepLatticeParams
+from fusion.lattice.lattice_config import LatticeParams
+from fusion.lattice.linear import LinearParams
+from fusion.lattice.pwl import PWLParams
+from fusion.targets import TargetConfig
 
-MODULES = ("projections", "pwl", "categorical", "linear", "grid", "ensemble", "deep_lattice")
+MODULES = (
+    "checks",
+    "lattice_config",
+    "projections",
+    "pwl",
+    "categorical",
+    "linear",
+    "lattice_layer",
+    "ensemble",
+    "deep_lattice",
+)
 
 
 @pytest.fixture(scope="module")
@@ -69,7 +81,7 @@ def test_pwl_equals_peers(peers: dict) -> None:
         1, 5, keypoints=(tuple(case["where"].tolist()),), missing_value=float(case["x"][-1])
     )
     params = PWLParams(jnp.asarray(case["outputs"])[None], None, jnp.asarray(case["missing"]))
-    _same(pwl.apply(params, config, jnp.asarray(case["x"])[:, None])[:, 0], case)
+    _same(pwl.apply(config, params, jnp.asarray(case["x"])[:, None])[:, 0], case)
 
 
 def test_pwl_with_learned_keypoints_equals_peer(peers: dict) -> None:
@@ -78,27 +90,27 @@ def test_pwl_with_learned_keypoints_equals_peer(peers: dict) -> None:
         1, 5, keypoints=(tuple(case["where"].tolist()),), learned_keypoints=True
     )  # fmt: skip
     params = PWLParams(jnp.asarray(case["outputs"])[None], jnp.asarray(case["logits"])[None])
-    _same(pwl.apply(params, config, jnp.asarray(case["x"])[:, None])[:, 0], case)
+    _same(pwl.apply(config, params, jnp.asarray(case["x"])[:, None])[:, 0], case)
 
 
 def test_categorical_equals_peers(peers: dict) -> None:
     case = peers["categorical"]
     config = CategoricalConfig(4, missing_value=-1)
     params = CategoricalParams(jnp.asarray(case["outputs"]), jnp.asarray(case["missing"][0]))
-    _same(categorical.apply(params, config, jnp.asarray(case["x"], jnp.int32)), case)
+    _same(categorical.apply(config, params, jnp.asarray(case["x"], jnp.int32)), case)
 
 
 def test_linear_equals_peers(peers: dict) -> None:
     case = peers["linear"]
     params = LinearParams(jnp.asarray(case["weights"])[None], jnp.asarray(case["bias"]))
     config = LinearConfig(6, bias=True)
-    _same(linear.apply(params, config, jnp.asarray(case["x"]))[:, 0], case)
+    _same(linear.apply(config, params, jnp.asarray(case["x"]))[:, 0], case)
 
 
 def test_linear_normalisation_equals_peer(peers: dict) -> None:
     case = peers["linear_norm"]
     config = LinearConfig(6, monotonicity=tuple(case["signs"].tolist()), normalized=True)
-    _same(linear.project(LinearParams(jnp.asarray(case["weights"])[None]), config).weights[0], case)
+    _same(linear.project(config, LinearParams(jnp.asarray(case["weights"])[None])).weights[0], case)
 
 
 @pytest.mark.parametrize("interpolation", ["hypercube", "simplex"])
@@ -106,7 +118,9 @@ def test_lattice_equals_peers(peers: dict, interpolation: str) -> None:
     case = peers[f"lattice_{interpolation}"]
     config = LatticeConfig((3, 2, 4), interpolation=interpolation)
     _same(
-        grid.apply(LatticeParams(jnp.asarray(case["vertices"])), config, jnp.asarray(case["x"])),
+        lattice_layer.apply(
+            config, LatticeParams(jnp.asarray(case["vertices"])), jnp.asarray(case["x"])
+        ),
         case,
     )
 
@@ -141,7 +155,7 @@ def test_lattice_projection_equals_peer(peers: dict, name: str, constraints: dic
     case = peers[f"project_{name}"]
     config = LatticeConfig(case["vertices"].shape, n_iterations=400, **constraints)
     params = LatticeParams(jnp.asarray(case["vertices"]))
-    _same(jax.jit(lambda p: grid.project(p, config))(params).vertices, case, atol=1e-4)
+    _same(jax.jit(lambda p: lattice_layer.project(config, p))(params).vertices, case, atol=1e-4)
 
 
 def test_deep_lattice_equals_peer(peers: dict) -> None:
@@ -155,7 +169,7 @@ def test_deep_lattice_equals_peer(peers: dict) -> None:
         PWLParams(jnp.asarray(case["hidden"])),
         LatticeParams(jnp.asarray(case["vertices"])),
     )
-    _same(deep_lattice.apply(params, config, jnp.asarray(case["x"])), case)
+    _same(deep_lattice.apply(config, params, jnp.asarray(case["x"])), case)
 
 
 # Closed forms.
@@ -165,13 +179,13 @@ def test_deep_lattice_equals_peer(peers: dict) -> None:
 def test_lattice_returns_its_vertices_and_is_linear_between(interpolation: str) -> None:
     config = LatticeConfig((3, 2, 4), interpolation=interpolation)
     table = jnp.asarray(np.random.default_rng(0).normal(size=config.sizes).astype(np.float32))
-    coordinates, held = vertices(LatticeParams(table), config)
+    coordinates, held = vertices(config, LatticeParams(table))
     points = np.array(list(itertools.product(*coordinates)), np.float32)
-    found = grid.apply(LatticeParams(table), config, jnp.asarray(points))
+    found = lattice_layer.apply(config, LatticeParams(table), jnp.asarray(points))
     np.testing.assert_allclose(found.reshape(config.sizes), held, atol=1e-6)
     plane = LatticeParams(jnp.asarray(np.indices(config.sizes).sum(0), jnp.float32))
     x = jnp.array([[0.3, 0.9, 2.4], [9.0, -1.0, 1.5]])
-    np.testing.assert_allclose(grid.apply(plane, config, x), [3.6, 3.5], atol=1e-6)
+    np.testing.assert_allclose(lattice_layer.apply(config, plane, x), [3.6, 3.5], atol=1e-6)
 
 
 def test_simplex_is_the_largest_coordinate_on_a_max_table() -> None:
@@ -180,9 +194,9 @@ def test_simplex_is_the_largest_coordinate_on_a_max_table() -> None:
     x = jnp.asarray(np.random.default_rng(1).uniform(size=(20, 3)).astype(np.float32))
     config = LatticeConfig((2, 2, 2), interpolation="simplex")
     np.testing.assert_allclose(
-        grid.apply(LatticeParams(table), config, x), np.max(x, axis=1), atol=1e-6
+        lattice_layer.apply(config, LatticeParams(table), x), np.max(x, axis=1), atol=1e-6
     )
-    smooth = grid.apply(LatticeParams(table), LatticeConfig((2, 2, 2)), x)
+    smooth = lattice_layer.apply(LatticeConfig((2, 2, 2)), LatticeParams(table), x)
     np.testing.assert_allclose(smooth, 1 - np.prod(1 - np.asarray(x), axis=1), atol=1e-6)
 
 
@@ -195,11 +209,11 @@ def test_pwl_interpolates_like_numpy_and_takes_nan_as_missing() -> None:
         missing=jnp.array([7.0, 8.0]),
     )
     x = rng.uniform(-2, 4, size=(6, 2)).astype(np.float32)
-    where, outputs = keypoints(params, config)
+    where, outputs = keypoints(config, params)
     expected = np.stack([np.interp(x[:, i], where[i], outputs[i]) for i in (0, 1)], axis=1)
     x[1, 0], expected[1, 0] = np.nan, 7.0
-    np.testing.assert_allclose(pwl.apply(params, config, jnp.asarray(x)), expected, atol=1e-6)
-    grads = jax.grad(lambda p: jnp.sum(pwl.apply(p, config, jnp.asarray(x))))(params)
+    np.testing.assert_allclose(pwl.apply(config, params, jnp.asarray(x)), expected, atol=1e-6)
+    grads = jax.grad(lambda p: jnp.sum(pwl.apply(config, p, jnp.asarray(x))))(params)
     assert all(bool(jnp.all(jnp.isfinite(g))) for g in jax.tree.leaves(grads))
     assert float(grads.missing[0]) == 1.0 and float(grads.missing[1]) == 0.0
 
@@ -207,18 +221,17 @@ def test_pwl_interpolates_like_numpy_and_takes_nan_as_missing() -> None:
 def test_learned_keypoints_stay_in_order_and_inside() -> None:
     config = PWLConfig(1, 6, (-1.0, 2.0), learned_keypoints=True)
     params = pwl.init(jax.random.key(0), config)
-    where, _ = keypoints(params, config)
+    where, _ = keypoints(config, params)
     np.testing.assert_allclose(where[0], np.linspace(-1, 2, 6), atol=1e-6)
-    moved, _ = keypoints(
-        params._replace(spacing=3.0 * jax.random.normal(jax.random.key(1), (1, 5))), config
-    )
+    spacing = 3.0 * jax.random.normal(jax.random.key(1), (1, 5))
+    moved, _ = keypoints(config, params._replace(spacing=spacing))
     assert float(moved[0, 0]) == -1.0 and float(moved[0, -1]) == 2.0
     assert np.all(np.diff(moved) > 0)
 
 
 def test_unknown_category_gives_nan() -> None:
     params = categorical.init(jax.random.key(0), CategoricalConfig(3))
-    found = categorical.apply(params, CategoricalConfig(3), jnp.array([0, 3, -1]))
+    found = categorical.apply(CategoricalConfig(3), params, jnp.array([0, 3, -1]))
     np.testing.assert_array_equal(np.isnan(found), [False, True, True])
 
 
@@ -226,9 +239,9 @@ def test_disconnected_weights_do_nothing() -> None:
     config = LinearConfig(3, 2, connected=((1, 1, 0), (0, 0, 1)))
     params = LinearParams(jnp.ones((2, 3)))
     np.testing.assert_array_equal(
-        linear.apply(params, config, jnp.array([1.0, 2.0, 4.0])), [3.0, 4.0]
+        linear.apply(config, params, jnp.array([1.0, 2.0, 4.0])), [3.0, 4.0]
     )
-    np.testing.assert_array_equal(linear.project(params, config).weights == 0, ~config.links)
+    np.testing.assert_array_equal(linear.project(config, params).weights == 0, ~config.links)
 
 
 def test_torsion_of_a_sum_is_zero() -> None:
@@ -249,36 +262,50 @@ def test_ensemble_is_the_mean_of_its_lattices() -> None:
     x = jnp.asarray(np.random.default_rng(0).uniform(0, 2, (5, 4)).astype(np.float32))
     one = LatticeConfig((3, 3))
     each = [
-        grid.apply(LatticeParams(table), one, x[:, np.array(subset)])
+        lattice_layer.apply(one, LatticeParams(table), x[:, np.array(subset)])
         for table, subset in zip(params.vertices, config.features, strict=True)
     ]
-    found = ensemble.apply(params, config, x)
+    found = ensemble.apply(config, params, x)
     np.testing.assert_allclose(found, np.mean(each, axis=0), atol=1e-6)
     uniform = dataclasses.replace(config, features=((0, 1),), monotonicity=(1, 1, 0, 0))
     broken = LatticeParams(jnp.array([[[1.0, 0.0, 0.2], [0.3, 0.9, 0.1], [0.5, 0.4, 2.0]]]))
-    alone = grid.project(
-        LatticeParams(broken.vertices[0]),
+    alone = lattice_layer.project(
         LatticeConfig((3, 3), (1, 1), output_range=(0.0, 1.0)),
+        LatticeParams(broken.vertices[0]),
     )
     np.testing.assert_allclose(
-        ensemble.project(broken, uniform).vertices[0], alone.vertices, atol=1e-6
+        ensemble.project(uniform, broken).vertices[0], alone.vertices, atol=1e-6
     )
 
 
 # Bad input, refused before anything is compiled.
 
+
+def unchecked(kind: type, **fields: object) -> object:
+    """A configuration made without the type checker of the tests, as in a user's program."""
+    config = object.__new__(kind)
+    for field in dataclasses.fields(kind):
+        object.__setattr__(config, field.name, fields.get(field.name, field.default))
+    config.__post_init__()
+    return config
+
+
 BAD = [
-    (lambda: PWLConfig(0), "n_inputs is 0"),
-    (lambda: PWLConfig(1, 1), "n_keypoints is 1"),
-    (lambda: PWLConfig(2, monotonicity=(1, 2)), r"monotonicity is \(1, 2\)"),
+    (lambda: PWLConfig(1, output_range=(0.0, math.inf)), "finite bounds"),
+    (lambda: TargetConfig(loss_range=(4.0, 0.0)), "loss_range=.* expected low < high"),
+    (lambda: TargetConfig(lattice_size=1), "lattice_size=1: expected 2 or more"),
+    (lambda: unchecked(LatticeConfig, sizes=(2,), interpolation="cubic"), "'cubic': expected"),
+    (lambda: PWLConfig(0), "n_inputs=0: expected 1 or more"),
+    (lambda: PWLConfig(1, 1), "n_keypoints=1: expected 2"),
+    (lambda: PWLConfig(2, monotonicity=(1, 2)), r"monotonicity=\(1, 2\): expected"),
     (lambda: PWLConfig(1, input_range=(1.0, 1.0)), "input_range"),
     (lambda: PWLConfig(1, output_range=(2.0, 1.0)), "low < high"),
     (lambda: PWLConfig(1, 3, keypoints=((0.0, 1.0, 1.0),)), "increase strictly"),
-    (lambda: CategoricalConfig(0), "n_categories is 0"),
-    (lambda: CategoricalConfig(3, missing_value=1), "is a category"),
+    (lambda: CategoricalConfig(0), "n_categories=0: expected"),
+    (lambda: CategoricalConfig(3, missing_value=1), "missing_value=1: expected .* is a category"),
     (lambda: CategoricalConfig(3, ((0, 1), (1, 0))), "circle"),
     (lambda: LinearConfig(2, monotonicity=(1,)), "monotonicity"),
-    (lambda: LinearConfig(2, monotonicity=(1, 0), dominance=((0, 1),)), "both must be"),
+    (lambda: LinearConfig(2, monotonicity=(1, 0), dominance=((0, 1),)), "both -1"),
     (lambda: LinearConfig(2, monotonicity=(1, 1), range_dominance=((0, 1),)), "input_range"),
     (lambda: LinearConfig(2, 1, connected=((0, 0),)), "connected"),
     (lambda: LatticeConfig((1, 2)), "sizes"),
@@ -290,14 +317,14 @@ BAD = [
         "opposite directions",
     ),
     (lambda: LatticeConfig((2, 2), n_iterations=0), "n_iterations"),
-    (lambda: EnsembleConfig(3, ((0, 1), (2,))), "subsets"),
+    (lambda: EnsembleConfig(3, ((0, 1), (2,))), "same number of inputs"),
     (lambda: EnsembleConfig(3, ((0, 3),)), "different inputs"),
     (lambda: random_features(0, 5, 2, 2), "more lattices"),
-    (lambda: random_features(0, 5, 2, 6), "rank is 6"),
-    (lambda: DeepLatticeConfig(3, (1, 0)), "one for each of"),
-    (lambda: DeepLatticeConfig(3, (1, 0, 0), n_monotone=0), "n_monotone is 0"),
+    (lambda: random_features(0, 5, 2, 6), "rank=6: expected"),
+    (lambda: DeepLatticeConfig(3, (1, 0)), "each of 3 inputs"),
+    (lambda: DeepLatticeConfig(3, (1, 0, 0), n_monotone=0), "n_monotone=0: expected"),
     (lambda: DeepLatticeConfig(1, (1,), n_monotone=1), "all inputs are monotone"),
-    (lambda: DeepLatticeConfig(3, embedding_dim=0), "embedding_dim is 0"),
+    (lambda: DeepLatticeConfig(3, embedding_dim=0), "embedding_dim=0: expected"),
     (
         lambda: regularizers.lattice_laplacian(LatticeParams(jnp.ones((2, 2))), l1=(1.0,)),
         "expected a float or 2",
@@ -311,17 +338,51 @@ def test_bad_input_is_named(call, message: str) -> None:
         call()
 
 
-@pytest.mark.parametrize("layer", ["pwl", "linear", "grid", "ensemble"])
+def test_every_error_has_the_same_form() -> None:
+    for call, _ in BAD:
+        with pytest.raises(ValueError, match=r"^[\w(), ]+=(.|\n)+: expected .+; .+$"):
+            call()
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields"),
+    [
+        (LatticeConfig, {"sizes": [2, 2]}),
+        (LatticeConfig, {"sizes": np.array([2, 2])}),
+        (PWLConfig, {"n_inputs": 2, "n_keypoints": 2, "keypoints": [[0.0, 1.0], [0.0, 2.0]]}),
+        (EnsembleConfig, {"n_inputs": 2, "features": ([0, 1],)}),
+    ],
+)
+def test_lists_are_refused_with_the_tuple_to_write(kind: type, fields: dict) -> None:
+    with pytest.raises(TypeError, match=r"expected tuples, .*; write \("):
+        unchecked(kind, **fields)
+
+
+@pytest.mark.parametrize(
+    ("kind", "fields"), [(PWLConfig, {"n_inputs": 1.5}), (LatticeConfig, {"sizes": (2, True)})]
+)
+def test_fractions_and_flags_are_no_counts(kind: type, fields: dict) -> None:
+    with pytest.raises(TypeError, match="expected a whole number"):
+        unchecked(kind, **fields)
+
+
+def test_legacy_keys_are_refused() -> None:
+    with pytest.raises(ValueError, match=r"key=uint32: expected a typed key; use jax\.random\.key"):
+        require_key(jax.random.PRNGKey(0))
+    require_key(jax.random.key(0))
+
+
+@pytest.mark.parametrize("layer", ["pwl", "linear", "lattice_layer", "ensemble"])
 def test_inputs_of_another_width_are_refused(layer: str) -> None:
     module, config = {
         "pwl": (pwl, PWLConfig(3)),
         "linear": (linear, LinearConfig(3)),
-        "grid": (grid, LatticeConfig((2, 2, 2))),
+        "lattice_layer": (lattice_layer, LatticeConfig((2, 2, 2))),
         "ensemble": (ensemble, EnsembleConfig(3, ((0, 1, 2),))),
     }[layer]
     params = jax.eval_shape(lambda key: module.init(key, config), jax.random.key(0))
     with pytest.raises(ValueError, match=r"expected \[\.\.\., 3\]"):
-        jax.eval_shape(lambda p: module.apply(p, config, jnp.ones((5, 1))), params)
+        jax.eval_shape(lambda p: module.apply(config, p, jnp.ones((5, 1))), params)
 
 
 @pytest.mark.parametrize("name", MODULES)

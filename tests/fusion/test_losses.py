@@ -152,13 +152,13 @@ def test_targets_fall_with_the_own_loss_whatever_the_parameters() -> None:
     noise = jax.tree.map(
         lambda p: p + jax.random.normal(jax.random.key(1), p.shape, p.dtype), params
     )
-    assert check_targets(noise, config) > 0
-    projected = project_targets(noise, config)
-    assert check_targets(projected, config) == 0
+    assert check_targets(config, noise) > 0
+    projected = project_targets(config, noise)
+    assert check_targets(config, projected) == 0
     others = jax.random.uniform(jax.random.key(2), (16, 4), maxval=4.0)
     grid = jnp.linspace(0.0, 5.0, 21)
     for k in range(4):
         losses = jnp.broadcast_to(others[:, None], (16, 21, 4)).at[:, :, k].set(grid)
-        targets = apply_targets(projected, config, losses.reshape(-1, 4)).reshape(16, 21, 4)
+        targets = apply_targets(config, projected, losses.reshape(-1, 4)).reshape(16, 21, 4)
         assert jnp.all(jnp.diff(targets[:, :, k], axis=1) <= 1e-6)
     assert jnp.all((targets >= 0) & (targets <= 1))

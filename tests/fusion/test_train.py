@@ -73,7 +73,7 @@ def test_learns_to_find_the_one_healthy_sensor(trained: object) -> None:
     assert parts.corrupted > 0.9  # by chance alone one in three
     assert gate_auroc(output.weights, output.failed) > 0.95
     assert trained.history[-1]["total"] < trained.history[0]["total"]
-    assert check_targets(trained.state.params["targets"], MODEL.targets) == 0
+    assert check_targets(MODEL.targets, trained.state.params["targets"]) == 0
 
 
 def test_resume_gives_the_same_bits(trained: object, tmp_path: Path) -> None:

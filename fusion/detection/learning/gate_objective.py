@@ -112,7 +112,7 @@ def gate_terms(
     seen = jax.lax.stop_gradient(seen) if options.stop_targets else seen
     targets = None
     if options.learned_targets:
-        targets = apply_targets(params["targets"], config.targets, seen)
+        targets = apply_targets(config.targets, params["targets"], seen)
     # The cross entropy of a single class is zero: what is left are the terms of the gate.
     none = jnp.zeros((weights.shape[0], 1))
     labels = jnp.zeros(weights.shape[0], jnp.int32)

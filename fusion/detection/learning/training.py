@@ -254,7 +254,7 @@ def train_step(
     rate = learning_rate(train, state.step)
     params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
     if "targets" in params:
-        params["targets"] = project_targets(params["targets"], config.targets)
+        params["targets"] = project_targets(config.targets, params["targets"])
     return DetectorState(params, stats, opt_state, state.step + 1), terms, failed
 
 

@@ -1,4 +1,4 @@
-"""Shape constraints of a lattice as sets of inequalities: projection, repair, violation.
+"""Constraints of a lattice as sets of inequalities: projection, repair, violation.
 
 Works on one array of vertices `[*sizes]`. The directions of monotonicity may be a traced array, so
 that lattices with different directions can share one vmapped program.
@@ -7,17 +7,14 @@ that lattices with different directions can share one vmapped program.
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import TYPE_CHECKING
 
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.projections import dykstra, isotonic
-
-if TYPE_CHECKING:
-    from fusion.lattice.grid import LatticeConfig
 
 __all__ = ["interior", "project_vertices", "violation"]
 
@@ -103,18 +100,18 @@ def _trust(
 
 
 def project_vertices(
-    v: Float[Array, "*sizes"],
-    signs: np.ndarray | Array,
     config: LatticeConfig,
+    signs: np.ndarray | Array,
+    v: Float[Array, "*sizes"],
     slack: Float[Array, ""],
 ) -> Float[Array, "*sizes"]:
     """Dykstra over the families of constraints, an exact repair, then the bounds.
 
     Args:
-        v: vertices.
+        config: sizes and the other constraints.
         signs: monotonicity of each axis `[rank]`. A numpy array tells which axes are free while
             tracing, so that they cost nothing; a traced array decides at run time.
-        config: sizes and the other constraints.
+        v: vertices.
         slack: slack to leave in each inequality.
 
     Returns:
@@ -158,7 +155,7 @@ def project_vertices(
             v = _repair_unimodal(v, axis, config.centre(axis), bend)
     v = clip(v)
     if config.edgeworth_trust:
-        v = _repair_trust(v, ramp, config, floor, ceiling)
+        v = _repair_trust(config, v, ramp, floor, ceiling)
     return v + slack * ramp
 
 
@@ -184,20 +181,20 @@ def _repair_unimodal(v: Array, axis: int, centre: int, sign: int) -> Array:
 
 
 def _repair_trust(
-    v: Array, ramp: Array, config: LatticeConfig, floor: Array | None, ceiling: Array | None
+    config: LatticeConfig, v: Array, ramp: Array, floor: Array | None, ceiling: Array | None
 ) -> Array:
     """Step towards a lattice inside all constraints, just far enough to end every violation."""
     bottom = jnp.min(v) if floor is None else floor
     top = jnp.max(v) if ceiling is None else ceiling
     target = bottom + (top - bottom) * ramp / jnp.max(ramp)
     slack = (top - bottom) / jnp.max(ramp)
-    worst = _trust_violation(v, config)
+    worst = _trust_violation(config, v)
     rounding = 8 * jnp.finfo(v.dtype).eps * (jnp.abs(bottom) + jnp.abs(top))
     share = (worst + rounding) / (worst + rounding + slack)
     return v + jnp.where(worst > 0, share, 0.0) * (target - v)
 
 
-def _trust_violation(v: Array, config: LatticeConfig) -> Array:
+def _trust_violation(config: LatticeConfig, v: Array) -> Array:
     worst = jnp.zeros((), v.dtype)
     for main, conditional, direction in config.edgeworth_trust:
         worst = jnp.maximum(worst, jnp.max(-direction * _mixed(v, main, conditional)))
@@ -205,10 +202,10 @@ def _trust_violation(v: Array, config: LatticeConfig) -> Array:
 
 
 def violation(
-    v: Float[Array, "*sizes"], signs: np.ndarray | Array, config: LatticeConfig
+    config: LatticeConfig, signs: np.ndarray | Array, v: Float[Array, "*sizes"]
 ) -> Float[Array, ""]:
     """Largest violation of any inequality between vertices, or of the bounds; 0 for none."""
-    worst = _trust_violation(v, config)
+    worst = _trust_violation(config, v)
     for axis in range(v.ndim):
         sign = jnp.asarray(signs[axis], v.dtype)
         worst = jnp.maximum(worst, jnp.max(-sign * jnp.diff(v, axis=axis)))

@@ -1,0 +1,166 @@
+"""The lattice: a learned table over a grid, interpolated between its vertices."""
+
+from __future__ import annotations
+
+import math
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float, Key
+
+from fusion.lattice.checks import require_key, require_width
+from fusion.lattice.constraints import project_vertices, violation
+from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
+from fusion.lattice.projections import MARGIN, tilt
+
+__all__ = ["apply", "check", "init", "project", "vertices"]
+
+
+def init(key: Key[Array, ""], config: LatticeConfig) -> LatticeParams:
+    """A plane across the output range, up or down with monotone inputs, at random with free ones.
+
+    Args:
+        key: PRNG key.
+        config: the lattice.
+
+    Returns:
+        LatticeParams; feasible.
+
+    Raises:
+        ValueError: a legacy key.
+    """
+    require_key(key)
+    low, high = config.output_range
+    if low is None:
+        low = 0.0 if high is None else high - 1.0
+    if high is None:
+        high = low + 1.0
+    index = np.indices(config.sizes)
+    coin = jax.random.rademacher(key, (config.rank,), dtype=jnp.float32)
+    plane = jnp.zeros(config.sizes)
+    for axis, size in enumerate(config.sizes):
+        fraction = jnp.asarray(index[axis] / (size - 1) - 0.5, jnp.float32)
+        unimodal = config.unimodality[axis] if config.unimodality else 0
+        if unimodal:
+            centre = config.centre(axis)
+            distance = np.abs(index[axis] - centre) / max(centre, size - 1 - centre) - 0.5
+            plane = plane + jnp.asarray(unimodal * distance, jnp.float32)
+        elif config.signs[axis]:
+            plane = plane + float(config.signs[axis]) * fraction
+        else:
+            plane = plane + coin[axis] * fraction
+    plane = low + (high - low) * (plane / config.rank + 0.5)
+    return project(config, LatticeParams(plane))
+
+
+def apply(
+    config: LatticeConfig, params: LatticeParams, x: Float[Array, "*batch rank"]
+) -> Float[Array, "*batch"]:
+    r"""The interpolated output at `x`.
+
+    Multilinear ("hypercube") interpolation weighs every vertex :math:`v` by
+
+    .. math:: f(x) = \sum_v \theta_v \prod_d \max(0, 1 - |x_d - v_d|)
+
+    simplex interpolation walks from the lower corner of the cell to the upper one along the
+    inputs in falling order of their fractional parts :math:`r`,
+
+    .. math:: f(x) = \theta_{p_0} + \sum_{k=1}^{D} r_{\pi(k)} (\theta_{p_k} - \theta_{p_{k-1}}),
+        \qquad p_k = p_{k-1} + e_{\pi(k)}
+
+    Symbols: :math:`\theta` is `params.vertices`; :math:`D` is the rank; :math:`\pi` sorts
+    :math:`r`. Both agree on vertices and edges, and keep monotonicity and bounds.
+
+    Args:
+        config: of the lattice.
+        params: of the lattice.
+        x: inputs in lattice coordinates `[0, sizes - 1]`; clipped.
+
+    Returns:
+        The output, without the last axis of `x`.
+
+    Raises:
+        ValueError: the last axis of `x` is not the number of inputs.
+
+    Source: Gupta et al. (2016), Monotonic calibrated interpolated look-up tables, sections 2-3.
+
+    Example:
+        >>> config = LatticeConfig((2, 2))
+        >>> params = LatticeParams(jnp.array([[0.0, 1.0], [2.0, 3.0]]))
+        >>> float(apply(config, params, jnp.array([0.5, 0.5])))
+        1.5
+    """
+    require_width(x, config.rank, "lattice_layer.apply")
+    if config.interpolation == "simplex":
+        return _simplex(config, params.vertices, x)
+    return _hypercube(config, params.vertices, x)
+
+
+def _hypercube(config: LatticeConfig, v: Array, x: Array) -> Array:
+    """Contract one axis after another, the largest product first as one matrix product."""
+    batch = x.shape[:-1]
+    lead = (1,) * len(batch)
+    rest = math.prod(config.sizes)
+    out = v
+    for axis, size in enumerate(config.sizes):
+        rest //= size
+        at = jnp.clip(x[..., axis], 0.0, size - 1.0)[..., None]
+        places = jnp.arange(size, dtype=x.dtype).reshape(*lead, size)
+        weights = jnp.maximum(1.0 - jnp.abs(at - places), 0.0)
+        if axis == 0:
+            out = weights @ out.reshape(size, rest)
+        else:
+            out = jnp.sum(weights[..., None] * out.reshape(*batch, size, rest), axis=-2)
+    return out.reshape(batch)
+
+
+def _simplex(config: LatticeConfig, v: Array, x: Array) -> Array:
+    sizes = np.asarray(config.sizes)
+    strides = np.cumprod([1, *sizes[:0:-1]])[::-1]
+    lead = (1,) * (x.ndim - 1)
+    top = jnp.asarray((sizes - 1).reshape(*lead, -1), x.dtype)
+    at = jnp.clip(x, 0.0, top)
+    corner = jnp.minimum(jnp.floor(at), top - 1.0)
+    fraction = at - corner
+    order = jnp.argsort(-fraction, axis=-1)
+    step = jnp.asarray(strides.reshape(*lead, -1), jnp.int32)
+    start = jnp.sum(corner.astype(jnp.int32) * step, axis=-1, keepdims=True)
+    steps = jnp.take_along_axis(jnp.broadcast_to(step, order.shape), order, axis=-1)
+    walk = jnp.concatenate([start, start + jnp.cumsum(steps, axis=-1)], axis=-1)
+    values = v.reshape(-1)[walk]
+    ordered = jnp.take_along_axis(fraction, order, axis=-1)
+    return values[..., 0] + jnp.sum(ordered * jnp.diff(values, axis=-1), axis=-1)
+
+
+def project(
+    config: LatticeConfig, params: LatticeParams, *, margin: float = MARGIN
+) -> LatticeParams:
+    """The nearest lattice that satisfies the constraints, by Dykstra and an exact last step.
+
+    One family of constraints is projected in closed form. Several take `config.n_iterations`
+    passes, which tend to the Euclidean projection; a last step then removes what violation is
+    left, so that the result is feasible after any number of passes.
+
+    Args:
+        config: of the lattice.
+        params: of the lattice.
+        margin: slack to leave, in float32 epsilons of the largest vertex; 0 for none.
+
+    Returns:
+        LatticeParams with `check(...) == 0`.
+    """
+    v = params.vertices
+    return LatticeParams(project_vertices(config, config.signs, v, tilt(v, margin)))
+
+
+def check(config: LatticeConfig, params: LatticeParams) -> Float[Array, ""]:
+    """Largest violation of any constraint; 0 where all hold."""
+    return violation(config, config.signs, params.vertices)
+
+
+def vertices(
+    config: LatticeConfig, params: LatticeParams
+) -> tuple[tuple[np.ndarray, ...], Float[Array, "*sizes"]]:
+    """Coordinates along each input, and the table of outputs over them."""
+    return tuple(np.arange(size, dtype=np.float32) for size in config.sizes), params.vertices

@@ -91,14 +91,14 @@ def require_signs(name: str, value: Any, n: int) -> None:
         )
 
 
-def require_key(key: Shaped[Array, "..."]) -> None:
+def require_key(given: Shaped[Array, "..."]) -> None:
     """Refuse a legacy key (two words of uint32).
 
     Raises:
         ValueError: the key is not a typed one.
     """
-    if not (hasattr(key, "dtype") and jnp.issubdtype(key.dtype, jax.dtypes.prng_key)):
-        kind = getattr(key, "dtype", type(key).__name__)
+    if not (hasattr(given, "dtype") and jnp.issubdtype(given.dtype, jax.dtypes.prng_key)):
+        kind = getattr(given, "dtype", type(given).__name__)
         raise ValueError(f"key={kind}: expected a typed key; use jax.random.key(seed)")
 
 

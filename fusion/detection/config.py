@@ -1,4 +1,4 @@
-"""Sizes and choices of the two-stage detector; the presets `paper`, `small` and `tiny`."""
+"""Sizes and choices of the two-stage detector; `fusion.detection.presets` has sets of them."""
 
 from __future__ import annotations
 
@@ -8,14 +8,13 @@ from typing import Literal, get_args
 from fusion.detection.geometry.anchors import AnchorConfig
 from fusion.detection.geometry.bev import BevConfig
 from fusion.gating import Normalizer
-from fusion.losses import LossConfig, LossParams
+from fusion.losses import LossConfig
 from fusion.targets import TargetConfig
 
-__all__ = ["DETECTORS", "DETECTOR_PRESETS", "DetectorConfig", "DetectorModel", "detector_preset"]
+__all__ = ["CAR_SIZES", "DETECTORS", "DetectorConfig", "DetectorModel"]
 
 DetectorModel = Literal["avod", "avod_argate"]
 DETECTORS: tuple[str, ...] = get_args(DetectorModel)
-DETECTOR_PRESETS = ("paper", "small", "tiny")
 
 # k-means of the 14,357 labelled cars of the usual training list: length, width, height [m].
 CAR_SIZES = ((3.513, 1.581, 1.511), (4.234, 1.653, 1.546))
@@ -44,10 +43,10 @@ class DetectorConfig:
         truth_proposals: shifted copies of each label among the training proposals (0 in AVOD).
         final_nms, max_detections, score_threshold: of the result.
         label_smoothing, regression_weight, angle_weight: of the losses.
-        gate_loss, gate_params, targets: terms of Equation 3.2, see `fusion.losses`.
+        gate_loss, targets: terms of Equation 3.2, see `fusion.losses`.
         auxiliary_second: the auxiliary paths of the views go on through the second stage.
         balanced_paths: the class losses of these paths weigh positives and negatives alike, and
-            the targets see how far their mean lies above what is usual for the view, in frames
+            the targets see how far their mean lies above its running mean for the view, in frames
             with positives; else class losses are means over the mini-batch and the targets see the
             whole losses of the paths.
     """
@@ -85,9 +84,6 @@ class DetectorConfig:
     regression_weight: float = 5.0
     angle_weight: float = 1.0
     gate_loss: LossConfig = dataclasses.field(default_factory=lambda: LossConfig(uniform_floor=1.0))
-    gate_params: LossParams = dataclasses.field(
-        default_factory=lambda: LossParams(alpha=1.0, beta=10.0, tau=0.1, anchor=30.0)
-    )
     targets: TargetConfig = dataclasses.field(
         default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0))
     )
@@ -97,9 +93,13 @@ class DetectorConfig:
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
         if self.model not in DETECTORS:
-            raise ValueError(f"model={self.model!r}, expected one of {', '.join(DETECTORS)}")
+            raise ValueError(f"model={self.model!r}: expected one of {', '.join(DETECTORS)}")
         if self.norm not in ("batch", "group"):
-            raise ValueError(f"norm={self.norm!r}, expected 'batch' or 'group'")
+            raise ValueError(f"norm={self.norm!r}: expected 'batch' or 'group'")
+        if self.normalizer not in get_args(Normalizer):
+            raise ValueError(
+                f"normalizer={self.normalizer!r}: expected one of {', '.join(get_args(Normalizer))}"
+            )
         if len(self.widths) != len(self.layers) or min(self.layers) < 1:
             raise ValueError(
                 f"widths={self.widths}, layers={self.layers}: expected one positive number of "
@@ -117,72 +117,3 @@ class DetectorConfig:
         for name in ("dropout", "path_drop"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: expected a share in [0, 1)")
-
-
-def detector_preset(name: str, model: str = "avod_argate") -> DetectorConfig:
-    """A preset of the detector.
-
-    Args:
-        name: `paper`, AVOD's sizes; `small`, 0.25 m cells over 44 x 44 m, images at a quarter of
-            the side and a quarter of the width, for two CPU cores; `tiny`, for tests.
-        model: `avod` or `avod_argate`.
-
-    Raises:
-        ValueError: unknown name or model.
-    """
-    if model not in DETECTORS:
-        raise ValueError(f"model={model!r}, expected one of {', '.join(DETECTORS)}")
-    base = DetectorConfig(model=model)  # type: ignore[arg-type]
-    if name == "paper":
-        return base
-    if name == "small":
-        return dataclasses.replace(
-            base,
-            bev=BevConfig(x_range=(-22.0, 22.0), z_range=(2.0, 46.0), cell=0.25),
-            anchors=AnchorConfig(CAR_SIZES, max_anchors=12_288),
-            image_size=(96, 320),
-            max_points=20_480,
-            max_objects=16,
-            widths=(8, 16, 32, 64),
-            norm="group",
-            rpn_width=64,
-            fc_widths=(512, 512),
-            gate_width=16,
-            dropout=0.1,
-            path_drop=0.3,
-            rpn_batch=128,
-            candidates=512,
-            proposals_train=128,
-            proposals=64,
-            second_batch=128,
-            truth_proposals=16,
-            max_detections=32,
-            score_threshold=0.02,
-            regression_weight=2.0,
-        )
-    if name == "tiny":
-        return dataclasses.replace(
-            base,
-            bev=BevConfig(x_range=(-8.0, 8.0), z_range=(4.0, 20.0), cell=0.5),
-            anchors=AnchorConfig(CAR_SIZES[1:], stride=1.0, max_anchors=128),
-            image_size=(16, 48),
-            max_points=1024,
-            max_objects=4,
-            widths=(4, 8),
-            layers=(1, 1),
-            norm="group",
-            rpn_width=8,
-            fc_widths=(16,),
-            second_crop=3,
-            gate_width=4,
-            dropout=0.0,
-            rpn_batch=16,
-            candidates=32,
-            proposals_train=16,
-            proposals=8,
-            second_batch=8,
-            truth_proposals=2,
-            max_detections=4,
-            score_threshold=0.0,
-        )
-    raise ValueError(f"preset={name!r}, expected one of {', '.join(DETECTOR_PRESETS)}")

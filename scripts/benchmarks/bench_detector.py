@@ -1,6 +1,6 @@
 """Frames per second of each stage of the detector, and the share of the device's peak.
 
-    python scripts/benchmarks/bench_detector.py --preset small
+    python scripts/benchmarks/bench_detector.py --size small
 
 times maps and anchors, the forward pass with both stages, suppression alone, and a training step,
 for a random cloud of points. The peak is a large float32 matrix product on the same device in the
@@ -16,10 +16,11 @@ import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 import tyro
 
+from snn_fusion_failure.commands.detector_runs import ModelOption, SizeOption
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
 
@@ -28,8 +29,8 @@ from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result
 class Config:
     """Time the stages of the detector."""
 
-    preset: Literal["paper", "small", "tiny"] = "small"
-    config: Literal["avod", "avod_argate"] = "avod_argate"
+    size: SizeOption = "small"
+    model: ModelOption = "avod_argate"
     batch_size: int = 1
     repeats: int = 5
     gemm: int = 1024
@@ -92,21 +93,18 @@ def main(config: Config) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from fusion.detection.config import detector_preset
-    from fusion.detection.geometry.nms import nms
-    from fusion.detection.learning.detect import detect
+    from fusion.detection.geometry.suppression import nms
     from fusion.detection.learning.examples import make_inputs, stack_examples
-    from fusion.detection.learning.training import init_training, train_step, training_preset
+    from fusion.detection.learning.inference import detect
+    from fusion.detection.learning.training import init_training, train_step
+    from fusion.detection.presets import preset
 
-    detector, training = (
-        detector_preset(config.preset, config.config),
-        training_preset(config.preset),
-    )
+    detector, training, params = preset(config.size, config.model)
     batch = stack_examples([_example(detector)] * config.batch_size)
     batch = jax.tree.map(jnp.asarray, batch)
     key = jax.random.key(0)
-    state = jax.jit(functools.partial(init_training, config=detector, train=training))(key)
-    read = jax.jit(lambda b: jax.lax.map(lambda e: make_inputs(e, detector), b))
+    state = jax.jit(functools.partial(init_training, config=detector))(key)
+    read = jax.jit(lambda b: jax.lax.map(lambda e: make_inputs(detector, e), b))
     inputs = read(batch)
     boxes = jax.random.uniform(key, (config.batch_size, detector.candidates, 2), maxval=40.0)
     boxes = jnp.concatenate([boxes, boxes + 4.0], axis=-1)
@@ -115,14 +113,14 @@ def main(config: Config) -> dict[str, Any]:
         b, s, jnp.ones(s.shape, bool), iou_threshold=detector.rpn_nms,
         max_output=detector.proposals_train, max_candidates=detector.candidates,
     )))  # fmt: skip
-    forward = jax.jit(functools.partial(detect, config=detector))
-    step = jax.jit(functools.partial(train_step, config=detector, train=training))
+    forward = jax.jit(functools.partial(detect, detector))
+    step = jax.jit(functools.partial(train_step, detector, training))
     main_params, stats = state.params["main"], state.stats
     stages: dict[str, tuple[Any, tuple[Any, ...], dict[str, Any]]] = {
         "maps and anchors": (read, (batch,), {}),
         "forward": (forward, (main_params, stats), {"inputs": inputs}),
         "suppression": (keep, (boxes, scores), {}),
-        "training step": (step, (state, key, batch), {}),
+        "training step": (step, (params.as_arrays(), state, batch), {"key": key}),
     }
     square = jnp.ones((config.gemm, config.gemm))
     product = jax.jit(lambda a: a @ a)
@@ -130,7 +128,7 @@ def main(config: Config) -> dict[str, Any]:
     rows = []
 
     def add(row: str, metric: str, unit: str, value: float) -> None:
-        cell = {"row": row, "model": config.config, "metric": metric, "unit": unit}
+        cell = {"row": row, "model": config.model, "metric": metric, "unit": unit}
         rows.append(cell | summarize([value]))
 
     add("matrix product", "gflops", "GFLOP/s", peak / 1e9)
@@ -150,13 +148,13 @@ def main(config: Config) -> dict[str, Any]:
     if config.record:
         title = "Throughput of the detector by stage"
         path = config.results / "bench_detector.json"
-        record_table(path, "bench_detector", title, rows, preset=config.preset)
+        record_table(path, "bench_detector", title, rows, preset=config.size)
     speed = {
         row["row"].replace(" ", "_"): row["mean"]
         for row in rows
         if row["metric"] == "frames_per_second"
     }
-    print_result(preset=config.preset, gemm_gflops=peak / 1e9, **speed)
+    print_result(size=config.size, gemm_gflops=peak / 1e9, **speed)
     return {"rows": rows}
 
 

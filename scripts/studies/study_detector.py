@@ -27,11 +27,11 @@ from typing import Any, Literal
 
 import tyro
 
+from snn_fusion_failure.commands import detector_runs as runs
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import fail, print_result, repository
 
-Model = Literal["avod", "avod_argate"]
-MODELS: tuple[Model, ...] = ("avod", "avod_argate")
+MODELS: tuple[runs.Model, ...] = ("avod", "avod_argate")
 METRICS = (
     "3d_easy_r40", "3d_moderate_r40", "3d_hard_r40", "bev_moderate_r40", "2d_moderate_r40",
     "3d_moderate_r11", "3d_moderate_r40_iou50", "bev_moderate_r40_iou50", "weight_auroc",
@@ -58,8 +58,8 @@ class Config:
     """Where the prepared examples go; DATA/cache_PRESET when left out."""
     seeds: int = 3
     first_seed: int = 0
-    models: tuple[Model, ...] = MODELS
-    preset: Literal["paper", "small", "tiny"] = "small"
+    models: tuple[runs.Model, ...] = MODELS
+    size: runs.SizeOption = "small"
     steps: int | None = None
     failures: bool = True
     """Sensors fail in training as well, for both models alike."""
@@ -74,12 +74,8 @@ class Config:
     """Pipeline check: train clean and evaluate on the training list, no failures."""
     any_size: bool = False
     """Accept images of other sizes than the benchmark's (simulated frames)."""
-    tau: float | None = None
-    alpha: float | None = None
-    beta: float | None = None
-    normalizer: Literal["softmax", "softmax_sigmoid"] | None = None
-    path_drop: float | None = None
-    truth_proposals: int | None = None
+    changes: runs.Changes = ()
+    """Constants of all runs, `detector.path_drop=0` `params.gate.tau=0.2`."""
     learning_rate: float | None = None
     out: Path = Path("runs/study_detector")
     """Folder of the runs."""
@@ -96,7 +92,7 @@ def evaluations(config: Config) -> list[tuple[str, int, str | None]]:
 
     unknown = [kind for kind in config.kinds if kind not in SENSOR_FAILURES]
     if unknown:
-        raise ValueError(f"failure {unknown[0]!r}, expected of {', '.join(SENSOR_FAILURES)}")
+        raise ValueError(f"kinds={unknown[0]!r}: expected of {', '.join(SENSOR_FAILURES)}")
     kinds: tuple[str | None, ...] = (None, *(config.kinds or SENSOR_FAILURES))
     if config.real:
         kinds = (None,)
@@ -105,7 +101,7 @@ def evaluations(config: Config) -> list[tuple[str, int, str | None]]:
 
 
 def _run_path(config: Config, model: str, seed: int) -> Path:
-    return config.out / f"{_table(config)}_{config.preset}" / f"{model}_s{seed}"
+    return config.out / f"{_table(config)}_{config.size}" / f"{model}_s{seed}"
 
 
 def _table(config: Config) -> str:
@@ -126,8 +122,8 @@ def _prepare(config: Config) -> None:
     from fusion.detection.learning.cache import open_cache
     from snn_fusion_failure.commands import train_detector as command
 
-    prepared = command.Prepare(config.data, config.preset, config.cache, any_size=config.any_size)
-    folder = command.cache_folder(prepared)
+    prepared = runs.Prepare(config.data, config.size, config.cache, any_size=config.any_size)
+    folder = runs.cache_folder(prepared)
     if not (folder / "cache.json").exists():
         command.prepare(prepared)
     split = _split(config)
@@ -145,16 +141,15 @@ def execute(config: Config) -> int:
     checked: set[Path] = set()
     for model, seed, failure in evaluations(config):
         record, run = _record(config, model, seed, failure), _run_path(config, model, seed)
-        options = command.Train(
-            config.data, model, config.preset, config.cache, seed=seed, steps=config.steps,  # type: ignore[arg-type]
-            failures=config.failures and not config.real, tau=config.tau, alpha=config.alpha,
-            beta=config.beta, normalizer=config.normalizer, path_drop=config.path_drop,
-            truth_proposals=config.truth_proposals, learning_rate=config.learning_rate, out=run,
+        options = runs.Train(
+            config.data, model, config.size, config.cache, seed=seed, steps=config.steps,  # type: ignore[arg-type]
+            failures=config.failures and not config.real, changes=config.changes,
+            learning_rate=config.learning_rate, out=run,
             resume=(run / "config.json").exists(),
         )  # fmt: skip
         if run not in checked:
-            cache = open_cache(command.cache_folder(options))
-            command.check_settings(run, *command.build(options, cache))
+            cache = open_cache(runs.cache_folder(options))
+            runs.check_settings(run, runs.build(options, cache))
             checked.add(run)
         if record.exists():
             continue
@@ -162,8 +157,8 @@ def execute(config: Config) -> int:
             print(f"train {model} seed {seed}", flush=True)
             command.train(options)
         result = command.evaluate(
-            command.Eval(
-                config.data, model, config.preset, config.cache, split=split, seed=seed, run=run,  # type: ignore[arg-type]
+            runs.Eval(
+                config.data, model, config.size, config.cache, split=split, seed=seed, run=run,  # type: ignore[arg-type]
                 failure=failure, severity=config.severity, overlap=config.overlap,
                 pictures=2 if failure is None else 0, out=record.parent,
             )
@@ -230,7 +225,7 @@ def main(config: Config) -> dict[str, Any]:
         title = TITLES.get(table, TITLES["study_detector"])
         if _split(config) == "test":
             table, title = f"{table}_test", f"{title}: test frames"
-        record_table(config.results / f"{table}.json", table, title, rows, preset=config.preset)
+        record_table(config.results / f"{table}.json", table, title, rows, preset=config.size)
     fields = {
         f"{row['model']}_{row['row'].replace(' ', '_')}": row["mean"]
         for row in rows

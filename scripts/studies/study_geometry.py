@@ -6,19 +6,45 @@ KITTI and SIM are folders in the layout of KITTI (SIM by `scripts/simulate_kitti
 table and writes `results/study_kitti_geometry.json`: lidar points of labelled cars and their image
 boxes, projected boxes against labelled ones, transforms there and back, fitted ground planes
 against given ones. A second a frame of the benchmark's size.
+
+A labelled car is a 3D box and an image box. With the right transforms
+
+* the lidar points in the 3D box project into the image box, and the projected 3D box is the image
+  box; this rests on the projection `P2`;
+* the points on and above the road around a car are those on its surface: of the points in the box
+  grown sideways nearly all lie in the box itself. This rests on the transform from the lidar, which
+  the first two do not: turn the scan by a degree, and fewer do.
+
+None of these is part of the benchmark; they are checks of the files and of their reader.
 """
 
 from __future__ import annotations
 
 import dataclasses
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
+import jax.numpy as jnp
+import numpy as np
 import tyro
+from jaxtyping import Bool, Float
 
+from fusion.detection.geometry.encodings import box_corners
+from fusion.detection.geometry.overlaps import image_iou
+from fusion.detection.geometry.planes import fit_plane, height_above, plane_difference
+from fusion.detection.kitti.calibration import (
+    back_project,
+    camera_to_lidar,
+    in_image,
+    lidar_to_camera,
+    project,
+)
+from fusion.detection.kitti.files import Frame, frame_names, read_frame
+from fusion.detection.kitti.objects import Objects, select
 from snn_fusion_failure.records.rows import record_table
 from snn_fusion_failure.runs import fail, print_result, progress, repository
 
+MARGIN, CLEARANCE = 0.5, 0.3  # [m], around a car and above its bottom face
 TITLE = "Lidar, camera and labels of KITTI frames (real) and of simulated ones"
 
 
@@ -37,13 +63,131 @@ class Config:
     results: Path = repository.RESULTS
 
 
+class FrameAlignment(NamedTuple):
+    """What one frame says; k labelled cars, of which m are not truncated.
+
+    Attributes:
+        in_box: `[k]` lidar points in the image and in the car's 3D box.
+        in_both: `[k]` those of them that project into its image box.
+        around: `[k]` points in the box grown by 0.5 m sideways, above its lowest 0.3 m.
+        around_in: `[k]` those of them in the box itself.
+        turned, turned_in: `[k]` the same for a scan turned by `turn` about the lidar's axis.
+        overlap: `[m]` intersection over union of projected and labelled image box.
+        lidar_error: largest distance of a point from itself after lidar, camera, lidar [m].
+        image_error: the same after camera, image, camera [m].
+        plane: (height [m], tilt [degree]) between the fitted ground plane and the given one; None
+            without a given one.
+        standing: `[k]` height of the cars' bottom centres above the fitted plane [m].
+    """
+
+    in_box: np.ndarray
+    in_both: np.ndarray
+    around: np.ndarray
+    around_in: np.ndarray
+    turned: np.ndarray
+    turned_in: np.ndarray
+    overlap: np.ndarray
+    lidar_error: float
+    image_error: float
+    plane: tuple[float, float] | None
+    standing: np.ndarray
+
+
+def inside_boxes(
+    points: Float[np.ndarray, "n 3"],
+    objects: Objects,
+    *,
+    margin: float = 0.0,
+    clearance: float = 0.0,
+) -> Bool[np.ndarray, "n k"]:
+    """Which camera-frame points lie in which 3D box.
+
+    Args:
+        points: `[n, 3]` [m].
+        objects: k of them, with 3D boxes.
+        margin: the boxes grow by it on their four sides [m].
+        clearance: so much of the box above its bottom face does not count [m].
+    """
+    away = points[:, None] - objects.location[None]
+    cos, sin = np.cos(objects.rotation_y)[None], np.sin(objects.rotation_y)[None]
+    along = away[..., 0] * cos - away[..., 2] * sin
+    across = away[..., 0] * sin + away[..., 2] * cos
+    height, width, length = objects.dimensions.T[:, None]
+    inside = (np.abs(along) < length / 2 + margin) & (np.abs(across) < width / 2 + margin)
+    return inside & (away[..., 1] < -clearance) & (away[..., 1] > -height)
+
+
+def projected_boxes(frame: Frame, objects: Objects) -> Float[np.ndarray, "k 4"]:
+    """Left, top, right, bottom [pixel] around the projected corners, cut at the image's border."""
+    boxes = np.concatenate(
+        [objects.location, objects.dimensions[:, [2, 1, 0]], objects.rotation_y[:, None]], axis=1
+    )
+    corners = np.asarray(box_corners(jnp.asarray(boxes, jnp.float32)), np.float64)
+    pixels, _ = project(frame.calibration, corners.reshape(-1, 3))
+    pixels = pixels.reshape(-1, 8, 2)
+    height, width = frame.image.shape[:2]
+    pixels = np.clip(pixels, 0.0, [width - 1.0, height - 1.0])
+    return np.concatenate([pixels.min(axis=1), pixels.max(axis=1)], axis=1)
+
+
+def _around(points: np.ndarray, cars: Objects, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """Points around each car, and those of them that are among the points inside its box."""
+    near = inside_boxes(points, cars, margin=MARGIN, clearance=CLEARANCE)
+    return near.sum(axis=0), (near & inside).sum(axis=0)
+
+
+def align_frame(frame: Frame, *, turn: float = 1.0) -> FrameAlignment:
+    """Check one labelled frame.
+
+    Args:
+        frame: with labels.
+        turn: angle of the wrong scan [degree].
+
+    Raises:
+        ValueError: the frame has no labels, or no ground plane is found.
+    """
+    if frame.labels is None:
+        raise ValueError(f"frame {frame.name} has no labels to compare with")
+    has_box = (frame.labels.dimensions > 0).all(axis=1)
+    cars = select(frame.labels, (frame.labels.type == "Car") & has_box)
+    calibration = frame.calibration
+    lidar = frame.points[:, :3].astype(np.float64)
+    camera = lidar_to_camera(calibration, lidar)
+    pixels, depth = project(calibration, camera)
+    seen = in_image(pixels, depth, *frame.image.shape[:2])
+    back = camera_to_lidar(calibration, camera)
+    again = back_project(calibration, pixels[seen], depth[seen])
+
+    inside = inside_boxes(camera[seen], cars)
+    box = cars.bbox[None]
+    at = pixels[seen][:, None]
+    in_image_box = ((at >= box[..., :2]) & (at <= box[..., 2:])).all(axis=2)
+    around, around_in = _around(camera[seen], cars, inside)
+    angle = np.radians(turn)
+    rotation = np.array(
+        [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
+    )
+    scan = lidar_to_camera(calibration, lidar[seen] @ rotation.T)
+    turned, turned_in = _around(scan, cars, inside_boxes(scan, cars))
+    whole = select(cars, cars.truncated == 0)
+    plane = fit_plane(camera).plane
+    return FrameAlignment(
+        in_box=inside.sum(axis=0),
+        in_both=(inside & in_image_box).sum(axis=0),
+        around=around,
+        around_in=around_in,
+        turned=turned,
+        turned_in=turned_in,
+        overlap=image_iou(projected_boxes(frame, whole), whole.bbox),
+        lidar_error=float(np.abs(back - lidar).max()),
+        image_error=float(np.abs(again - camera[seen]).max()),
+        plane=None if frame.plane is None else plane_difference(plane, frame.plane),
+        standing=height_above(plane, cars.location),
+    )
+
+
 def measure(folder: Path, frames: int, any_size: bool) -> list[dict[str, Any]]:
     """Rows of one folder: name, unit, mean over what `n` counts."""
-    import numpy as np
-
-    from fusion.detection.alignment import align_frame
-    from fusion.detection.kitti.files import frame_names, read_frame
-
     names = frame_names(folder / "training" / "image_2", ".png")[:frames]
     found = []
     with progress() as bar:

@@ -5,12 +5,17 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
-from snn_fusion_failure.runs import to_jsonable
+import tyro
+
+from snn_fusion_failure.runs import apply_changes, to_jsonable
 
 Model = Literal["avod", "avod_argate"]
-PresetName = Literal["paper", "small", "tiny"]
+Size = Literal["paper", "small", "tiny"]
+ModelOption = Annotated[Model, tyro.conf.arg(aliases=["--config"])]
+SizeOption = Annotated[Size, tyro.conf.arg(aliases=["--preset"])]
+Changes = Annotated[tuple[str, ...], tyro.conf.arg(name="set")]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -19,9 +24,10 @@ class Prepare:
 
     data: Path
     """KITTI folder."""
-    preset: PresetName = "small"
+    size: SizeOption = "small"
+    """Of the network: `paper` (accelerators), `small` (two CPU cores), `tiny` (tests)."""
     cache: Path | None = None
-    """Where the examples go; DATA/cache_PRESET when left out."""
+    """Where the examples go; DATA/cache_SIZE when left out."""
     splits: tuple[str, ...] = ("train", "val")
     """Lists in ImageSets, the first one gives the anchor sizes; `testing`: all of ROOT/testing."""
     add: bool = False
@@ -37,8 +43,8 @@ class Train:
     """Train one detector."""
 
     data: Path
-    config: Model = "avod_argate"
-    preset: PresetName = "small"
+    model: ModelOption = "avod_argate"
+    size: SizeOption = "small"
     cache: Path | None = None
     split: str = "train"
     seed: int = 0
@@ -49,22 +55,11 @@ class Train:
     """One sensor fails in two thirds of the training frames."""
     failure_kinds: tuple[str, ...] = ()
     """Only these failures, e.g. camera_noise lidar_loss; all when left out."""
-    norm: Literal["batch", "group"] | None = None
-    normalizer: Literal["softmax", "softmax_sigmoid"] | None = None
-    """Of the fusion weights; softmax_sigmoid is the printed one."""
-    alpha: float | None = None
-    """Weight of the auxiliary losses (Equation 3.2)."""
-    beta: float | None = None
-    """Weight of the fusion-weight regularization (Equation 3.2)."""
-    tau: float | None = None
-    """Temperature of the fixed targets."""
-    path_drop: float | None = None
-    """Probability to drop a view in training."""
-    truth_proposals: int | None = None
-    """Shifted copies of each label among the training proposals."""
+    changes: Changes = ()
+    """Other constants, `detector.path_drop=0` `training.flip=false` `params.gate.tau=0.2`."""
     checkpoint_every: int = 500
     out: Path | None = None
-    """Run folder; runs/detector/DATA_CONFIG_PRESET[_failures]_sSEED when left out."""
+    """Run folder; runs/detector/DATA_MODEL_SIZE[_failures]_sSEED when left out."""
     resume: bool = False
     overwrite: bool = False
 
@@ -74,8 +69,8 @@ class Eval:
     """Evaluate a trained detector, all sensors working or one failed."""
 
     data: Path
-    config: Model = "avod_argate"
-    preset: PresetName = "small"
+    model: ModelOption = "avod_argate"
+    size: SizeOption = "small"
     cache: Path | None = None
     split: str = "val"
     """List in ImageSets, or `testing`: result files only, since there are no labels."""
@@ -99,46 +94,55 @@ class Eval:
 
 # Options that do not change the numbers of a run.
 NOT_SETTINGS = ("out", "resume", "overwrite", "data", "cache", "checkpoint_every")
-CLASS = "Car"
+
+_OLD_NAMES = {"config": "model", "preset": "size"}  # of options, in runs until 0.2
+_OLD_OPTIONS = {
+    "norm": "detector.norm", "normalizer": "detector.normalizer",
+    "path_drop": "detector.path_drop", "truth_proposals": "detector.truth_proposals",
+    "alpha": "params.gate.alpha", "beta": "params.gate.beta", "tau": "params.gate.tau",
+}  # fmt: skip
 
 
 def cache_folder(config: Prepare | Train | Eval) -> Path:
-    """Where the examples of a data folder and preset are."""
-    return config.cache or config.data / f"cache_{config.preset}"
+    """Where the examples of a data folder and size are."""
+    return config.cache or config.data / f"cache_{config.size}"
 
 
 def run_folder(config: Train | Eval) -> Path:
     """Where a training keeps its files."""
     failing = "_failures" if config.failures else ""
-    name = f"{config.data.resolve().name}_{config.config}_{config.preset}{failing}_s{config.seed}"
+    name = f"{config.data.resolve().name}_{config.model}_{config.size}{failing}_s{config.seed}"
     return Path("runs") / "detector" / name
 
 
-def build(config: Train, cache: Any) -> tuple[Any, Any]:
-    """Detector and training of a command line, for a cache."""
-    from fusion.detection.learning.training import training_preset
+def build(config: Train, cache: Any) -> Any:
+    """The `DetectorSetup` of a command line, for a cache."""
+    from fusion.detection.presets import DetectorSetup, preset
 
-    if cache.preset != config.preset:
+    if cache.size != config.size:
         raise ValueError(
-            f"{cache.folder} was prepared for preset {cache.preset!r}, not {config.preset!r}: run "
-            "`prepare` with the preset of the training"
+            f"{cache.folder} was prepared for size {cache.size!r}, not {config.size!r}: run "
+            "`prepare` with the size of the training"
         )
-    detector = cache.config(config.config)
-    given = {k: getattr(config, k) for k in ("norm", "normalizer", "path_drop", "truth_proposals")}
-    detector = dataclasses.replace(detector, **{k: v for k, v in given.items() if v is not None})
-    weights = {k: v for k in ("alpha", "beta", "tau") if (v := getattr(config, k)) is not None}
-    detector = dataclasses.replace(detector, gate_params=detector.gate_params._replace(**weights))
-    train = training_preset(config.preset)
-    given = {k: getattr(config, k) for k in ("steps", "batch_size", "learning_rate")}
+    _, train, params = preset(config.size, config.model)
+    given = {k: getattr(config, k) for k in ("steps", "batch_size")}
     changes = {k: v for k, v in given.items() if v is not None}
     if config.failures:
         changes["failure_share"] = 2.0 / 3.0
     if config.failure_kinds:
         changes["failure_kinds"] = config.failure_kinds
-    return detector, dataclasses.replace(train, **changes)
+    if config.learning_rate is not None:
+        params = params._replace(learning_rate=config.learning_rate)
+    parts = {
+        "detector": cache.config(config.model),
+        "training": dataclasses.replace(train, **changes),
+        "params": params,
+    }
+    made = apply_changes(parts, config.changes)
+    return DetectorSetup(made["detector"], made["training"], made["params"])
 
 
-def load_run(folder: Path, detector: Any, training: Any) -> Any:
+def load_run(folder: Path, setup: Any) -> Any:
     """The newest state of a run folder.
 
     Raises:
@@ -146,7 +150,7 @@ def load_run(folder: Path, detector: Any, training: Any) -> Any:
     """
     from fusion.detection.learning.fitting import restore_detector
 
-    state = restore_detector(folder / "checkpoints", detector, training)
+    state = restore_detector(setup.config, folder / "checkpoints")
     if state is None:
         raise FileNotFoundError(f"{folder} holds no checkpoint: run `train` first")
     return state
@@ -162,27 +166,30 @@ def run_config(folder: Path, config: Eval) -> Train:
     if not path.is_file():
         raise FileNotFoundError(f"{folder} holds no run: run `train` first")
     held = json.loads(path.read_text(encoding="utf-8"))["settings"]
+    held = {_OLD_NAMES.get(k, k): v for k, v in held.items()}
+    old = {k: held.pop(k) for k in _OLD_OPTIONS if k in held}
+    changes = [f"{_OLD_OPTIONS[k]}={json.dumps(v)}" for k, v in old.items() if v is not None]
+    held["changes"] = (*changes, *held.get("changes", ()))
     held["failure_kinds"] = tuple(held["failure_kinds"])
     return Train(data=config.data, cache=config.cache, **held)
 
 
-def resolved(detector: Any, training: Any) -> dict[str, Any]:
+def resolved(setup: Any) -> dict[str, Any]:
     """All settings of a training as JSON values, those of the presets too."""
-    parts = {"detector": dataclasses.asdict(detector), "training": dataclasses.asdict(training)}
-    for name in ("gate_params", "gate_loss"):
-        value = parts["detector"][name]
-        parts["detector"][name] = value._asdict() if hasattr(value, "_asdict") else value
-    if detector.model == "avod":
+    detector, training = dataclasses.asdict(setup.config), dataclasses.asdict(setup.train)
+    numbers = setup.params._asdict()
+    detector["gate_params"] = numbers.pop("gate")._asdict()
+    training |= numbers
+    if setup.config.model == "avod":
         # What only the gate reads may differ.
         of_gate = ("gate", "targets", "auxiliary", "balanced", "normalizer")
-        kept = {k: v for k, v in parts["detector"].items() if not k.startswith(of_gate)}
-        parts["detector"] = kept
-        parts["training"].pop("target_rate")
-    held: dict[str, Any] = to_jsonable(parts)
+        detector = {k: v for k, v in detector.items() if not k.startswith(of_gate)}
+        training.pop("target_rate")
+    held: dict[str, Any] = to_jsonable({"detector": detector, "training": training})
     return held
 
 
-def check_settings(folder: Path, detector: Any, training: Any) -> None:
+def check_settings(folder: Path, setup: Any) -> None:
     """Refuse a finished run whose settings are not those of this command line and these presets.
 
     Runs are kept and taken up again, while the presets' numbers live in the code: a run from before
@@ -195,7 +202,7 @@ def check_settings(folder: Path, detector: Any, training: Any) -> None:
     if not path.is_file():
         return
     held = json.loads(path.read_text(encoding="utf-8")).get("settings", {})
-    for part, now in resolved(detector, training).items():
+    for part, now in resolved(setup).items():
         before = held.get(part, {})
         # A setting that is new since then has its default, which changes nothing.
         for key in sorted(now.keys() & before.keys()):

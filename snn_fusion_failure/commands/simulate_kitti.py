@@ -93,7 +93,7 @@ def main(config: Config) -> dict[str, Any]:
     from fusion.detection.kitti.files import write_split
     from fusion.detection.simulator.frames import simulate_frames, split_layouts, write_frame
     from fusion.detection.simulator.layouts import read_layouts
-    from fusion.detection.simulator.sensors import SIZES, nominal_calibration
+    from fusion.detection.simulator.rendering import SIZES, nominal_calibration
 
     enable_compilation_cache()
     sensor_config = SIZES[config.size]
@@ -118,7 +118,7 @@ def main(config: Config) -> dict[str, Any]:
     with progress() as bar:
         task = bar.add_task("simulate", total=len(todo), status="")
         frames = simulate_frames(
-            todo, scene_config, sensor_config, config.seed, batch_size=config.batch_size
+            scene_config, sensor_config, todo, seed=config.seed, batch_size=config.batch_size
         )
         for frame in frames:
             for name, n in write_frame(folder, frame, calibration).items():

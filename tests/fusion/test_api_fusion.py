@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 
 from fusion import encoders, failures, gating, losses, targets
-from fusion.detection.geometry import encodings, nms, overlaps
+from fusion.detection.geometry import encodings, overlaps, suppression
 from fusion.detection.learning import detection_loss
 from fusion.detection.network import crop
 from fusion.lattice import (
@@ -267,41 +267,41 @@ CASES = [
         normal((3,)),
     ),
     Case(
-        "detection.encodings.box_corners",
+        "detection.geometry.encodings.box_corners",
         encodings.box_corners,
         lambda rng: (boxes(rng),),
     ),
     Case(
-        "detection.encodings.box3d_to_box4c",
+        "detection.geometry.encodings.box3d_to_box4c",
         lambda b: encodings.box3d_to_box4c(b, jnp.asarray(PLANE)),
         lambda rng: (boxes(rng),),
     ),
     Case(
-        "detection.encodings.encode_offsets",
+        "detection.geometry.encodings.encode_offsets",
         encodings.encode_offsets,
         lambda rng: (anchors(rng), anchors(rng)),
         (0, 1),
     ),
     Case(
-        "detection.encodings.decode_offsets",
+        "detection.geometry.encodings.decode_offsets",
         encodings.decode_offsets,
         lambda rng: (anchors(rng), *f32(0.1 * rng.normal(size=(3, 6)))),
         (0, 1),
     ),
     Case(
-        "detection.encodings.angle_vector",
+        "detection.geometry.encodings.angle_vector",
         encodings.angle_vector,
         lambda rng: f32(rng.uniform(-3, 3, 4)),
     ),
     Case(
-        "detection.overlaps.image_iou",
+        "detection.geometry.overlaps.image_iou",
         overlaps.image_iou,
         lambda rng: (upright(rng, 4), upright(rng, 4)),
         (0, 1),
     ),
     Case(
-        "detection.nms.nms",
-        lambda b, s: nms.nms(
+        "detection.geometry.suppression.nms",
+        lambda b, s: suppression.nms(
             b, s, jnp.ones(5, bool), iou_threshold=0.5, max_output=3, max_candidates=5
         ),
         lambda rng: (upright(rng, 5), *f32(rng.random(5))),
@@ -309,11 +309,11 @@ CASES = [
         INTEGERS,
     ),
     Case(
-        "detection.crop.crop_and_resize",
+        "detection.network.crop.crop_and_resize",
         lambda f, b: crop.crop_and_resize(f, b, (2, 2)),
         lambda rng: f32(rng.normal(size=(6, 6, 2)), [[0.1, 0.1, 0.6, 0.7], [0.2, 0.3, 0.9, 0.8]]),
     ),
-    Case("detection.detection_loss.smooth_l1", detection_loss.smooth_l1, normal((6,))),
+    Case("detection.learning.detection_loss.smooth_l1", detection_loss.smooth_l1, normal((6,))),
 ]
 
 

@@ -5,10 +5,14 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.detection.alignment import align_frame, inside_boxes, projected_boxes
 from fusion.detection.kitti.calibration import Calibration
 from fusion.detection.kitti.files import Frame
 from fusion.detection.kitti.objects import Objects
+from tests._scripts import load_script
+
+study = load_script("studies/study_geometry")
+align_frame, inside_boxes = study.align_frame, study.inside_boxes
+projected_boxes = study.projected_boxes
 
 P2 = np.array([[700.0, 0, 620, 40], [0, 700.0, 187, 0], [0, 0, 1, 0]])
 VELO = np.array([[0.0, -1, 0, 0.02], [0, 0, -1, -0.06], [1, 0, 0, -0.3]])

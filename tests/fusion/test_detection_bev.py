@@ -44,7 +44,7 @@ def test_maps_equal_one_point_at_a_time() -> None:
     clouds[1][0, 1] = np.nan
     padded, masks = zip(*(pad_points(c, 800) for c in clouds), strict=True)
     plane = jnp.asarray(PLANE)
-    batched = jax.jit(jax.vmap(lambda p, m: bev_maps(p, m, plane, SMALL)))
+    batched = jax.jit(jax.vmap(lambda p, m: bev_maps(SMALL, p, m, plane)))
     got = batched(jnp.asarray(np.stack(padded)), jnp.asarray(np.stack(masks)))
     assert got.shape == (2, 12, 16, 6) and got.dtype == jnp.float32
     for cloud, map_ in zip(clouds, got, strict=True):
@@ -57,7 +57,7 @@ def test_maps_equal_one_point_at_a_time() -> None:
 
 def test_far_is_up_and_left_is_left() -> None:
     points, mask = pad_points(np.array([[-3.9, 1.0, 5.9]]), 4)
-    maps = bev_maps(jnp.asarray(points), jnp.asarray(mask), jnp.asarray(PLANE), SMALL)
+    maps = bev_maps(SMALL, jnp.asarray(points), jnp.asarray(mask), jnp.asarray(PLANE))
     assert np.argwhere(np.asarray(maps[..., -1])).tolist() == [[0, 0]]
 
 
@@ -109,7 +109,7 @@ def test_crops_pass_gradients_and_refuse_no_size() -> None:
 def test_ground_box_finds_its_cells() -> None:
     # A box that covers cells 2..4 along z (rows 7..9 from the top) and columns 6..9.
     box = jnp.array([[-1.0, 1.0, 1.0, 2.5]])
-    unit = ground_to_unit(box, SMALL)
+    unit = ground_to_unit(SMALL, box)
     rows, columns = SMALL.shape
     edges = np.asarray(unit[0]) * np.array([rows - 1, columns - 1, rows - 1, columns - 1])
     # Borders of cells lie half a cell before their centres.
@@ -129,7 +129,7 @@ def test_full_size_maps_of_a_real_frame(data_dir: Path) -> None:
     points, mask = pad_points(camera, 40_000)
     assert frame.plane is not None
     plane = frame.plane.astype(np.float32)
-    maps = jax.jit(partial(bev_maps, config=BevConfig()))(
+    maps = jax.jit(partial(bev_maps, BevConfig()))(
         jnp.asarray(points), jnp.asarray(mask), jnp.asarray(plane)
     )
     expected = plain_maps(points[mask].astype(np.float64), plane, BevConfig())

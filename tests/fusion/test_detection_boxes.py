@@ -31,7 +31,7 @@ from fusion.detection.geometry.encodings import (
     project_boxes,
     resolve_heading,
 )
-from fusion.detection.geometry.nms import nms, pairwise
+from fusion.detection.geometry.suppression import nms, pairwise
 
 PLANE = jnp.array([0.02, -0.9997, 0.01, 1.6])
 
@@ -203,7 +203,7 @@ ANCHORS = AnchorConfig(sizes=((3.5, 1.5, 1.5), (4.0, 2.0, 1.6)), stride=1.0, max
 
 
 def test_grid_stands_on_the_ground() -> None:
-    grid = np.asarray(anchor_grid(PLANE, AREA, ANCHORS))
+    grid = np.asarray(anchor_grid(ANCHORS, AREA, PLANE))
     assert grid.shape == (10 * 10 * 4, 6)
     np.testing.assert_allclose(grid[:, :3] @ np.asarray(PLANE)[:3] + PLANE[3], 0.0, atol=1e-4)
     assert sorted({tuple(np.round(r, 2)) for r in grid[:, 3:].tolist()}) == [
@@ -211,7 +211,7 @@ def test_grid_stands_on_the_ground() -> None:
     ]  # fmt: skip
     assert grid[:, 0].min() == -4.5 and grid[:, 2].max() == 9.5
     full = jax.eval_shape(
-        lambda p: anchor_grid(p, BevConfig(), AnchorConfig(((4.0, 2.0, 1.0),) * 2)), PLANE
+        lambda p: anchor_grid(AnchorConfig(((4.0, 2.0, 1.0),) * 2), BevConfig(), p), PLANE
     )
     assert full.shape == (89_600, 6)
     for wrong in ({"sizes": ()}, {"sizes": ((1.0, 2.0, 0.0),)}):
@@ -229,9 +229,9 @@ def test_only_anchors_over_points_are_kept(size: int) -> None:
     x, z = rng.uniform(-4, 4, 6), rng.uniform(1, 9, 6)
     y = -(plane[0] * x + plane[2] * z + plane[3] - height) / plane[1]
     points, mask = pad_points(np.stack([x, y, z], axis=1), 8)
-    grid = anchor_grid(PLANE, AREA, ANCHORS)
+    grid = anchor_grid(ANCHORS, AREA, PLANE)
     config = AnchorConfig(sizes=ANCHORS.sizes, stride=1.0, max_anchors=size)
-    got = jax.jit(partial(select_anchors, bev=AREA, config=config))(
+    got = jax.jit(partial(select_anchors, config, AREA))(
         grid, jnp.asarray(points), jnp.asarray(mask), PLANE
     )
     # By hand: cells that hold a point, anchors whose rounded borders hold such a cell.
@@ -251,9 +251,9 @@ def test_only_anchors_over_points_are_kept(size: int) -> None:
 
 
 def test_a_dead_lidar_leaves_anchors_everywhere() -> None:
-    grid = anchor_grid(PLANE, AREA, ANCHORS)
+    grid = anchor_grid(ANCHORS, AREA, PLANE)
     nothing = jnp.zeros((4, 3)), jnp.zeros(4, bool)
-    got = jax.jit(partial(select_anchors, bev=AREA, config=ANCHORS))(grid, *nothing, PLANE)
+    got = jax.jit(partial(select_anchors, ANCHORS, AREA))(grid, *nothing, PLANE)
     assert int(got.n_occupied) == 0
     kept = np.asarray(got.boxes)[np.asarray(got.mask)]
     assert len(kept) == 200

@@ -13,14 +13,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.detection.config import DetectorConfig, detector_preset
+from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import box3d_to_box4c, box_corners, project_boxes
-from fusion.detection.geometry.proposals import Detections, anchor_boxes, decode_second, final_boxes
 from fusion.detection.kitti.calibration import Calibration
 from fusion.detection.kitti.files import Frame
 from fusion.detection.kitti.objects import Objects
 from fusion.detection.learning import fitting
-from fusion.detection.learning.detect import to_objects
 from fusion.detection.learning.detection_loss import (
     balanced_class_loss,
     class_loss,
@@ -35,21 +33,24 @@ from fusion.detection.learning.examples import (
 )
 from fusion.detection.learning.fitting import fit_detector, frame_order, run_detector
 from fusion.detection.learning.gate_objective import gate_terms, path_losses
+from fusion.detection.learning.inference import to_objects
+from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.sampling import Assignment, Sample, assign, draw
 from fusion.detection.learning.scoring import car_precision, image_scale, weight_auroc
 from fusion.detection.learning.training import (
     SENSOR_FAILURES,
-    DetectorTraining,
+    DetectorTrainConfig,
     learning_rate,
-    training_preset,
 )
 from fusion.detection.network.convolution import convolve
 from fusion.detection.network.detector import count_main_parameters, fuse, init_detector
 from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
+from fusion.detection.network.proposals import Detections, anchor_boxes, decode_second, final_boxes
 from fusion.detection.network.views import TransposedConv
+from fusion.detection.presets import preset
 from fusion.targets import check_targets
 
-TINY = detector_preset("tiny")
+TINY = preset("tiny").config
 PLANE = np.array([0.0, -1.0, 0.0, 1.6])
 
 
@@ -82,7 +83,7 @@ def a_frame(seed: int = 0) -> Frame:
 
 @pytest.fixture(scope="module")
 def example() -> Example:
-    made, counts = make_example(a_frame(), TINY)
+    made, counts = make_example(TINY, a_frame())
     assert counts == {"plane_fitted": False, "points_dropped": 0, "labels_dropped": 0}
     return made
 
@@ -103,14 +104,14 @@ def test_examples_keep_what_is_in_the_picture(example: Example) -> None:
     np.testing.assert_allclose(example.image_size, [32, 96])
 
     few = dataclasses.replace(TINY, max_points=50, max_objects=1)
-    made, counts = make_example(frame, few)
+    made, counts = make_example(few, frame)
     assert counts["points_dropped"] == seen.sum() - 50 and counts["labels_dropped"] == 1
     np.testing.assert_allclose(made.truth[0, 2], 9.4)  # the nearer one stays
     behind = frame._replace(points=frame.points * np.array([-1, 1, 1, 1], np.float32))
     with pytest.raises(ValueError, match="frame 000000: none of 600 lidar points lies in the im"):
-        make_example(behind, TINY)
+        make_example(TINY, behind)
     with pytest.raises(ValueError, match=r"frame 000000: .* points near the expected ground"):
-        make_example(frame._replace(plane=None, points=frame.points[:9]), TINY)
+        make_example(TINY, frame._replace(plane=None, points=frame.points[:9]))
 
 
 def test_mirrored_frames_keep_their_projection(example: Example) -> None:
@@ -189,12 +190,12 @@ def test_transposed_convolution_equals_the_dilated_one() -> None:
 def test_parameters_match_and_weights_start_even() -> None:
     for name in ("paper", "small"):
         avod, argate = (
-            count_main_parameters(detector_preset(name, m)) for m in ("avod", "avod_argate")
+            count_main_parameters(preset(name, m).config) for m in ("avod", "avod_argate")
         )
         assert avod < argate < 1.02 * avod
     batch_norm = dataclasses.replace(TINY, norm="batch")
     params, stats = jax.jit(partial(init_detector, config=batch_norm))(jax.random.key(0))
-    assert set(params) == {"main", "auxiliary", "targets", "usual_losses"}
+    assert set(params) == {"main", "auxiliary", "targets", "mean_losses"}
     assert jax.tree.leaves(stats)
     assert float(jnp.abs(params["main"]["gate"]["fusion"]["kernel"]).max()) == 0
     kernel = params["main"]["second"]["fc0"]["kernel"]
@@ -220,7 +221,7 @@ def test_mini_batches_are_half_positive_at_most() -> None:
     many = Assignment(positive, jnp.arange(n) >= 32, jnp.zeros(n, jnp.int32))
     chosen = set()
     for seed in range(20):
-        sample = draw(jax.random.key(seed), many, 16)
+        sample = draw(many, 16, key=jax.random.key(seed))
         index = np.asarray(sample.indices)
         assert sample.valid.all() and len(set(index.tolist())) == 16
         assert (index[np.asarray(sample.positive)] < 30).all() and sample.positive.sum() == 8
@@ -228,7 +229,7 @@ def test_mini_batches_are_half_positive_at_most() -> None:
         chosen |= set(index.tolist())
     assert len(chosen) > 30  # drawn, not always the same
     few = Assignment(jnp.arange(n) < 2, jnp.arange(n) >= 35, many.match)
-    sample = draw(jax.random.key(0), few, 16)
+    sample = draw(few, 16, key=jax.random.key(0))
     assert sample.positive.sum() == 2 and sample.valid.sum() == 7
 
 
@@ -257,30 +258,30 @@ def test_gate_is_regularized_by_what_the_views_tell_apart() -> None:
     config = dataclasses.replace(
         TINY, gate_loss=dataclasses.replace(TINY.gate_loss, learned_targets=False)
     )
-    even, wanted = jnp.full((1, 2), 0.5), (jnp.zeros((1, 4, 6)),)
-    stage = path_losses(views, wanted, sample, config)
+    gate, even, wanted = DetectorParams().gate, jnp.full((1, 2), 0.5), (jnp.zeros((1, 4, 6)),)
+    stage = path_losses(config, views, wanted, sample)
     told = np.log1p(np.exp(-6.0))
     np.testing.assert_allclose(stage.balanced, [[np.log(2), told]], rtol=1e-4)
     # Boxes: half the square of 1 in six columns, times their weight.
     boxes = 3.0 * config.regression_weight
     np.testing.assert_allclose(stage.whole, [[np.log(2), told + boxes]], rtol=1e-4)
     # Its boxes are worse, and yet the second view's weight should rise: it tells objects from the
-    # background better than it usually does, by more than the first one.
-    usual = jnp.array([0.6, 0.1])
-    params = {"usual_losses": usual}
-    target = jax.nn.softmax(-(stage.balanced - usual[None]) / config.gate_params.tau)
+    # background better than it meanly does, by more than the first one.
+    mean = jnp.array([0.6, 0.1])
+    params = {"mean_losses": mean}
+    target = jax.nn.softmax(-(stage.balanced - mean[None]) / gate.tau)
     assert target[0, 1] > 0.5
-    total, auxiliary, regularization = gate_terms(params, config, even, [stage, stage])
-    off = 0.5 * ((stage.balanced - usual[None]) ** 2).sum()
-    parts = config.gate_params.alpha * auxiliary + config.gate_params.beta * regularization
+    total, auxiliary, regularization = gate_terms(config, gate, params, even, [stage, stage])
+    off = 0.5 * ((stage.balanced - mean[None]) ** 2).sum()
+    parts = gate.alpha * auxiliary + gate.beta * regularization
     np.testing.assert_allclose(total, parts + off, rtol=1e-4)
     np.testing.assert_allclose(auxiliary, stage.whole.sum(), rtol=1e-4)  # half of each, twice
     np.testing.assert_allclose(regularization, ((0.5 - target) ** 2).sum(), rtol=1e-4)
     # A frame without objects says nothing about its sensors.
-    empty = path_losses(views, wanted, sample._replace(positive=jnp.zeros((1, 4), bool)), config)
-    assert float(gate_terms(params, config, even, [empty])[2]) == 0.0
-    slope = jax.grad(lambda p: gate_terms(p, config, even, [stage])[0])(params)
-    np.testing.assert_allclose(slope["usual_losses"], usual - stage.balanced[0], rtol=1e-3)
+    empty = path_losses(config, views, wanted, sample._replace(positive=jnp.zeros((1, 4), bool)))
+    assert float(gate_terms(config, gate, params, even, [empty])[2]) == 0.0
+    slope = jax.grad(lambda p: gate_terms(config, gate, p, even, [stage])[0])(params)
+    np.testing.assert_allclose(slope["mean_losses"], mean - stage.balanced[0], rtol=1e-3)
 
 
 def test_right_offsets_decode_to_the_label() -> None:
@@ -295,7 +296,7 @@ def test_right_offsets_decode_to_the_label() -> None:
     twice = jnp.concatenate([boxes, boxes + 0.05, boxes.at[:, 0].add(30.0)])
     scores = jnp.array([[0.0, 2], [0, 3], [0, 1], [0, 0.5], [0, -3], [0, 4]])
     mask = jnp.array([True, True, True, True, True, False])
-    found = final_boxes(twice, scores, mask, jnp.array([0.4, 0.6]), config)
+    found = final_boxes(config, twice, scores, mask, jnp.array([0.4, 0.6]))
     # Doubles go, the fifth is below the threshold, the sixth is no proposal.
     assert found.mask.tolist() == [True, True, False]
     np.testing.assert_allclose(found.boxes[:2], truth[::-1], atol=1e-4)
@@ -304,7 +305,7 @@ def test_right_offsets_decode_to_the_label() -> None:
 
 def test_detections_become_kitti_objects() -> None:
     frame = a_frame()
-    truth = np.asarray(make_example(frame, TINY)[0].truth[:3], np.float32)
+    truth = np.asarray(make_example(TINY, frame)[0].truth[:3], np.float32)
     truth[2] = [0, 1.6, -9, 4, 1.6, 1.5, 0]  # behind the camera
     found = Detections(
         jnp.asarray(truth), jnp.array([0.9, 0.8, 0.7]), jnp.ones(3, bool), jnp.full(2, 0.5)
@@ -323,10 +324,11 @@ def test_detections_become_kitti_objects() -> None:
     assert weight_auroc(np.array([[0.5, 0.5]] * 4), np.array([[0.2, 0.8]] * 4), 0) == 1.0
 
 
-FAILING = DetectorTraining(
-    steps=6, batch_size=1, learning_rate=3e-3, schedule="cosine", failure_share=0.9,
-    failure_kinds=("camera_noise", "lidar_loss"), l2=0.0, l2_dense=0.0,
+FAILING = DetectorTrainConfig(
+    steps=6, batch_size=1, schedule="cosine", failure_share=0.9,
+    failure_kinds=("camera_noise", "lidar_loss"),
 )  # fmt: skip
+RATES = DetectorParams(learning_rate=3e-3, l2=0.0, l2_dense=0.0)
 
 
 @pytest.mark.relaxed
@@ -334,10 +336,14 @@ def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) ->
     folder = tmp_path / "checkpoints"
     rows: list[int] = []
     whole = fit_detector(
-        3, TINY, FAILING, 3, lambda i: example, report_every=2,
+        TINY, FAILING, RATES, 3, lambda i: example, seed=3, report_every=2,
         on_report=lambda step, row: rows.append(step),
     )  # fmt: skip
     assert rows == [2, 4, 6] and int(whole.state.step) == 6
+    other = RATES._replace(learning_rate=1e-4, l2=1e-3, clip_norm=1.0)
+    slow = fit_detector(TINY, FAILING, other, 3, lambda i: example, seed=3, report_every=2)
+    assert slow.history[0]["total"] != slow.history[-1]["total"] != whole.history[-1]["total"]
+    # Other rates ran the same program.
     assert fitting._step(TINY, FAILING)._cache_size() == 1  # type: ignore[attr-defined]
     assert all(np.isfinite(list(row.values())).all() for row in whole.history)
     assert whole.history[0]["rpn_positives"] > 0 and whole.history[0]["positives"] > 0
@@ -349,26 +355,34 @@ def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) ->
             raise KeyboardInterrupt
 
     with pytest.raises(KeyboardInterrupt):
-        fit_detector(3, TINY, FAILING, 3, lambda i: example, report_every=2, on_report=stop,
-                     checkpoint_dir=folder)  # fmt: skip
+        fit_detector(TINY, FAILING, RATES, 3, lambda i: example, seed=3, report_every=2,
+                     on_report=stop, checkpoint_dir=folder)  # fmt: skip
     with pytest.raises(ValueError, match="holds checkpoints of another run"):
-        fit_detector(3, TINY, FAILING, 3, lambda i: example, checkpoint_dir=folder)
+        fit_detector(TINY, FAILING, RATES, 3, lambda i: example, checkpoint_dir=folder)
     again = fit_detector(
-        3, TINY, FAILING, 3, lambda i: example, report_every=2, checkpoint_dir=folder, resume=True
+        TINY,
+        FAILING,
+        RATES,
+        3,
+        lambda i: example,
+        seed=3,
+        report_every=2,
+        checkpoint_dir=folder,
+        resume=True,
     )
     for a, b in zip(jax.tree.leaves(whole.state), jax.tree.leaves(again.state), strict=True):
         np.testing.assert_array_equal(a, b)
 
-    found = run_detector(whole.state, TINY, [example, example])
+    found = run_detector(TINY, whole.state, [example, example])
     assert len(found) == 2 and found[0].boxes.shape == (4, 7)
     np.testing.assert_array_equal(found[0].boxes, found[1].boxes)
     assert found[0].mask.any() and np.isfinite(found[0].boxes).all()
     np.testing.assert_allclose(found[0].weights.sum(), 1.0, rtol=1e-5)
     # A dead lidar leaves the camera's proposals.
-    dead = run_detector(whole.state, TINY, [example], failure="lidar_loss")
+    dead = run_detector(TINY, whole.state, [example], failure="lidar_loss")
     assert dead[0].mask.any()
-    with pytest.raises(ValueError, match="failure 'lidar_theft', expected one of camera_noise"):
-        run_detector(whole.state, TINY, [example], failure="lidar_theft")
+    with pytest.raises(ValueError, match="failure='lidar_theft': expected one of camera_noise"):
+        run_detector(TINY, whole.state, [example], failure="lidar_theft")
 
 
 def test_every_frame_comes_once_in_an_epoch() -> None:
@@ -379,21 +393,28 @@ def test_every_frame_comes_once_in_an_epoch() -> None:
 
 
 def test_choices_are_checked_and_rates_fall() -> None:
-    paper = training_preset("paper")
-    np.testing.assert_allclose(learning_rate(paper, jnp.int32(59_999)), 0.8e-4, rtol=1e-5)
-    np.testing.assert_allclose(learning_rate(paper, jnp.int32(60_000)), 0.64e-4, rtol=1e-5)
+    _, paper, rates = preset("paper")
+    np.testing.assert_allclose(learning_rate(paper, rates, jnp.int32(59_999)), 0.8e-4, rtol=1e-5)
+    np.testing.assert_allclose(learning_rate(paper, rates, jnp.int32(60_000)), 0.64e-4, rtol=1e-5)
     for make, message in (
-        (lambda: DetectorTraining(failure_share=1.5), "failure_share=1.5"),
-        (lambda: DetectorTraining(steps=0), "steps=0"),
-        (lambda: DetectorTraining(failure_kinds=("sun",)), "failure 'sun', expected of camera_no"),
-        (lambda: DetectorTraining(failure_share=0.5, failure_kinds=("camera_fog",)), "of each"),
-        (lambda: detector_preset("huge"), "preset='huge', expected one of paper"),
-        (lambda: detector_preset("small", "yolo"), "model='yolo'"),
+        (lambda: DetectorTrainConfig(failure_share=1.5), "failure_share=1.5"),
+        (lambda: DetectorTrainConfig(steps=0), "steps=0"),
+        (
+            lambda: DetectorTrainConfig(failure_kinds=("sun",)),
+            "failure_kinds='sun': expected of camera_no",
+        ),
+        (lambda: DetectorTrainConfig(failure_share=0.5, failure_kinds=("camera_fog",)), "of each"),
+        (lambda: preset("huge"), "size='huge': expected one of paper"),
+        (lambda: preset("small", "yolo"), "model='yolo'"),
         (lambda: DetectorConfig(widths=(6, 8), layers=(1, 1), norm="group"), "multiples of 4"),
         (lambda: DetectorConfig(layers=(1,)), "one positive number of layers"),
         (lambda: DetectorConfig(rpn_iou=(0.6, 0.5)), "rpn_iou=.0.6, 0.5."),
         (lambda: DetectorConfig(dropout=1.0), "dropout=1.0"),
-        (lambda: training_preset("huge"), "preset='huge'"),
+        (lambda: DetectorConfig(normalizer="sparsemax"), "normalizer='sparsemax': expected"),  # type: ignore[arg-type]
+        (lambda: DetectorTrainConfig(schedule="step"), "schedule='step': expected"),  # type: ignore[arg-type]
+        (lambda: DetectorParams(learning_rate=-1.0), "learning_rate=-1.0: expected a finite"),
+        (lambda: DetectorParams()._replace(clip_norm=0.0), "clip_norm=0.0: expected"),
+        (lambda: DetectorParams(l2=float("nan")), "l2=nan: expected"),
     ):
         with pytest.raises(ValueError, match=message):
             make()
@@ -403,19 +424,18 @@ def test_choices_are_checked_and_rates_fall() -> None:
 @pytest.mark.slow
 @pytest.mark.relaxed
 def test_avod_learns_two_cars(example: Example) -> None:
-    config = detector_preset("tiny", "avod")
-    train = dataclasses.replace(
-        FAILING, steps=300, failure_share=0.0, flip=False, learning_rate=1e-2
-    )
-    fitted = fit_detector(0, config, train, 1, lambda i: example)
+    config = preset("tiny", "avod").config
+    train = dataclasses.replace(FAILING, steps=300, failure_share=0.0, flip=False)
+    rates = RATES._replace(learning_rate=1e-2)
+    fitted = fit_detector(config, train, rates, 1, lambda i: example)
     assert fitted.history[-1]["total"] < 0.2 * fitted.history[0]["total"]
-    found = run_detector(fitted.state, config, [example])[0]
+    found = run_detector(config, fitted.state, [example])[0]
     best = found.boxes[:2][np.argsort(found.boxes[:2, 2])]
     np.testing.assert_allclose(best[:, [0, 2]], example.truth[:2, [0, 2]], atol=0.5)
 
 
 def test_inputs_of_a_batch(example: Example) -> None:
     batch = stack_examples([example, example])
-    inputs = jax.jit(jax.vmap(partial(make_inputs, config=TINY)))(batch)
+    inputs = jax.jit(jax.vmap(partial(make_inputs, TINY)))(batch)
     assert inputs.bev.shape == (2, 32, 32, 6) and inputs.anchors.shape == (2, 128, 6)
     assert int(inputs.n_occupied[0]) > 10 and inputs.bev[0].max() > 0.5

@@ -11,12 +11,15 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from fusion.detection.config import detector_preset
-from fusion.detection.learning.examples import Inputs
 from fusion.detection.network.detector import init_detector
-from fusion.detection.probes import probe_auroc, read_bodies, read_views
+from fusion.detection.network.inputs import Inputs
+from fusion.detection.presets import preset
+from tests._scripts import load_script
 
-CONFIG = detector_preset("tiny")
+study = load_script("studies/study_views")
+probe_auroc, read_bodies, read_views = study.probe_auroc, study.read_bodies, study.read_views
+
+CONFIG = preset("tiny").config
 HEADER = (
     "label,kind,points,pixels,share,dark_paint,low_contrast,night,x,y,z,length,width,height,"
     "rotation_y\n"
@@ -72,7 +75,7 @@ def test_crops_are_those_of_the_boxes() -> None:
     )  # fmt: skip
     boxes = jnp.array([[-3.0, 1.6, 12, 4, 1.6, 1.5, 0.0], [4.0, 1.6, 16, 4, 1.6, 1.5, 1.57]])
     params, stats = jax.jit(partial(init_detector, config=CONFIG))(jax.random.key(0))
-    read = jax.jit(partial(read_views, config=CONFIG))
+    read = jax.jit(partial(read_views, CONFIG))
     got = read(params["main"], stats, inputs=inputs, boxes=boxes)
     pixels = got.pixels.reshape(2, 3, 3, 3)
     # The middle of a box lies at its centre's projection, to the depth's perspective.

@@ -7,15 +7,16 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.detection.kitti.hdl64 import ELEVATIONS, beam_of
-from fusion.detection.learning.sensor_failures import (
+from fusion.detection.sensors import (
     CAMERA_FAILURES,
     LIDAR_FAILURES,
+    beam_of,
     camera_failure,
     lidar_failure,
     random_camera_failure,
     random_lidar_failure,
 )
+from fusion.detection.sensors.hdl64 import ELEVATIONS
 
 KEY = jax.random.key(3)
 camera = jax.jit(camera_failure, static_argnames="kind")
@@ -39,21 +40,21 @@ def scan() -> tuple[jax.Array, jax.Array]:
 
 def test_severity_zero_changes_nothing(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
     for kind in CAMERA_FAILURES:
-        np.testing.assert_array_equal(camera(KEY, image, kind, jnp.float32(0)), image)
+        np.testing.assert_array_equal(camera(image, kind, jnp.float32(0), key=KEY), image)
     for kind in LIDAR_FAILURES:
-        points, mask = lidar(KEY, *scan, kind, jnp.float32(0))
+        points, mask = lidar(*scan, kind, jnp.float32(0), key=KEY)
         np.testing.assert_array_equal(points, scan[0])
         np.testing.assert_array_equal(mask, scan[1])
 
 
 def test_more_severity_leaves_less(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
     for kind in CAMERA_FAILURES:
-        out = [camera(KEY, image, kind, jnp.float32(s)) for s in (0.3, 1.0)]
+        out = [camera(image, kind, jnp.float32(s), key=KEY) for s in (0.3, 1.0)]
         assert all(float(o.min()) >= 0 and float(o.max()) <= 1 for o in out)
         change = [float(jnp.abs(o - image).mean()) for o in out]
         assert change[0] > 0.02 and change[1] >= change[0]
     kept = {
-        kind: [int(lidar(KEY, *scan, kind, jnp.float32(s))[1].sum()) for s in (0.3, 1.0)]
+        kind: [int(lidar(*scan, kind, jnp.float32(s), key=KEY)[1].sum()) for s in (0.3, 1.0)]
         for kind in LIDAR_FAILURES
     }
     n = int(scan[1].sum())
@@ -64,18 +65,18 @@ def test_more_severity_leaves_less(image: jax.Array, scan: tuple[jax.Array, jax.
 
 def test_fog_follows_koschmieder(image: jax.Array) -> None:
     depth = jnp.full(image.shape[:2], 25.0).at[0].set(jnp.inf).at[1].set(0.0)
-    out = camera(KEY, image, "fog", jnp.float32(1), depth=depth)
+    out = camera(image, "fog", jnp.float32(1), depth=depth, key=KEY)
     np.testing.assert_allclose(out[0], 0.8, atol=1e-6)  # sky: airlight alone
     np.testing.assert_allclose(out[1], image[1], atol=1e-6)
     # At the visibility 5 % of the contrast is left.
     np.testing.assert_allclose(out[2:], 0.05 * image[2:] + 0.95 * 0.8, atol=1e-5)
-    constant = camera(KEY, image, "fog", jnp.float32(0.5))
+    constant = camera(image, "fog", jnp.float32(0.5), key=KEY)
     through = 0.05 ** (0.5 * 30 / 25)
     np.testing.assert_allclose(constant, through * image + (1 - through) * 0.8, atol=1e-5)
 
 
 def test_exposure_gains_then_saturates(image: jax.Array) -> None:
-    out = [camera(jax.random.key(i), image, "exposure", jnp.float32(0.4)) for i in range(8)]
+    out = [camera(image, "exposure", jnp.float32(0.4), key=jax.random.key(i)) for i in range(8)]
     bright = [o for o in out if float(o.mean()) > float(image.mean())]
     dark = [o for o in out if float(o.mean()) < float(image.mean())]
     assert bright and dark
@@ -86,9 +87,9 @@ def test_exposure_gains_then_saturates(image: jax.Array) -> None:
 
 def test_blur_is_a_gaussian_mean(image: jax.Array) -> None:
     flat = jnp.full((9, 64, 3), 0.4)
-    np.testing.assert_allclose(camera(KEY, flat, "blur", jnp.float32(1)), 0.4, rtol=1e-5)
+    np.testing.assert_allclose(camera(flat, "blur", jnp.float32(1), key=KEY), 0.4, rtol=1e-5)
     point = jnp.zeros((25, 64, 3)).at[12, 32].set(1.0)
-    spread = np.asarray(camera(KEY, point, "blur", jnp.float32(1)))[:, :, 0]
+    spread = np.asarray(camera(point, "blur", jnp.float32(1), key=KEY))[:, :, 0]
     assert spread.sum() == pytest.approx(1.0, abs=1e-4)
     sd = 0.02 * 64
     offset = np.arange(-2, 3)
@@ -100,14 +101,14 @@ def test_blur_is_a_gaussian_mean(image: jax.Array) -> None:
 def test_camera_noise_has_the_stated_variance() -> None:
     # Little enough that clipping at 0 and 1 does not matter.
     grey = jnp.full((100, 100, 3), 0.5)
-    sd = float((camera(KEY, grey, "noise", jnp.float32(0.2)) - grey).std())
+    sd = float((camera(grey, "noise", jnp.float32(0.2), key=KEY) - grey).std())
     assert sd == pytest.approx(0.2 * np.sqrt(0.4**2 + 0.1 * 0.5), rel=0.02)
 
 
 def test_range_noise_stays_on_the_beam(scan: tuple[jax.Array, jax.Array]) -> None:
     clean, mask = scan
     n = int(mask.sum())
-    points, _ = lidar(KEY, clean, mask, "noise", jnp.float32(0.5))
+    points, _ = lidar(clean, mask, "noise", jnp.float32(0.5), key=KEY)
     before, after = np.asarray(clean)[:n, :3], np.asarray(points)[:n, :3]
     r0, r1 = np.linalg.norm(before, axis=1), np.linalg.norm(after, axis=1)
     np.testing.assert_allclose(after / r1[:, None], before / r0[:, None], atol=1e-5)
@@ -122,14 +123,14 @@ def test_lost_beams_are_rings_and_lost_sectors_are_azimuths(
     n = int(mask.sum())
     beam = np.repeat(np.arange(64), 90)
     np.testing.assert_array_equal(beam_of(clean)[:n], beam)
-    points, kept = lidar(KEY, clean, mask, "beam_loss", jnp.float32(0.25))
+    points, kept = lidar(clean, mask, "beam_loss", jnp.float32(0.25), key=KEY)
     per_beam = np.asarray(kept)[:n].reshape(64, 90).sum(axis=1)
     assert set(per_beam.tolist()) == {0, 90} and (per_beam == 0).sum() == 16
     assert float(jnp.abs(points[~kept]).max()) == 0.0  # what is lost cannot be read
-    _, kept = lidar(KEY, clean, mask, "beam_loss", jnp.float32(1))
+    _, kept = lidar(clean, mask, "beam_loss", jnp.float32(1), key=KEY)
     assert int(kept.sum()) == 4 * 90
 
-    _, kept = lidar(KEY, clean, mask, "sector_dropout", jnp.float32(1))
+    _, kept = lidar(clean, mask, "sector_dropout", jnp.float32(1), key=KEY)
     gone = ~np.asarray(kept)[:n].reshape(64, 90)
     assert (gone == gone[0]).all() and gone[0].sum() in (14, 15, 16)  # 60 of 360 degrees
     azimuth = np.arange(-180, 180, 4)[gone[0]]
@@ -139,22 +140,24 @@ def test_lost_beams_are_rings_and_lost_sectors_are_azimuths(
 def test_drawn_kind_under_vmap(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
     keys = jax.random.split(KEY, 12)
     pair = ("blackout", "fog")
-    out = jax.jit(jax.vmap(lambda k: random_camera_failure(k, image, kinds=pair)))(keys)
+    out = jax.jit(jax.vmap(lambda k: random_camera_failure(image, kinds=pair, key=k)))(keys)
     dark = np.asarray(out).max(axis=(1, 2, 3)) == 0.0
     assert 0 < dark.sum() < 12
     through = 0.05 ** (30 / 25)
     fog = through * np.asarray(image) + (1 - through) * 0.8
     np.testing.assert_allclose(out[~dark], np.broadcast_to(fog, out[~dark].shape), atol=1e-5)
-    draw = jax.vmap(lambda k: random_lidar_failure(k, *scan, kinds=("loss", "beam_loss"))[1].sum())
+    draw = jax.vmap(
+        lambda k: random_lidar_failure(*scan, kinds=("loss", "beam_loss"), key=k)[1].sum()
+    )
     assert set(jax.jit(draw)(keys).tolist()) == {0, 4 * 90}
 
 
 def test_bad_input_is_named(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
     with pytest.raises(ValueError, match="camera failure 'rain': expected one of noise, blackout"):
-        camera_failure(KEY, image, "rain")
+        camera_failure(image, "rain", key=KEY)
     with pytest.raises(ValueError, match="lidar failure 'fog': expected one of noise, beam_loss"):
-        lidar_failure(KEY, *scan, "fog")
-    with pytest.raises(ValueError, match=r"severity is 1\.5, expected a number from 0"):
-        camera_failure(KEY, image, "noise", 1.5)
+        lidar_failure(*scan, "fog", key=KEY)
+    with pytest.raises(ValueError, match=r"severity=1\.5: expected a number from 0"):
+        camera_failure(image, "noise", 1.5, key=KEY)
     with pytest.raises(ValueError, match="lidar failure none given"):
-        random_lidar_failure(KEY, *scan, kinds=())
+        random_lidar_failure(*scan, kinds=(), key=KEY)

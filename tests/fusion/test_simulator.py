@@ -24,8 +24,7 @@ from fusion.detection.simulator.layouts import (
     read_layouts,
 )
 from fusion.detection.simulator.raycast import GROUND, SKY, cast
-from fusion.detection.simulator.scene import KINDS, Scene, SceneConfig, build_scene
-from fusion.detection.simulator.sensors import (
+from fusion.detection.simulator.rendering import (
     SIZES,
     Readings,
     SensorConfig,
@@ -33,11 +32,12 @@ from fusion.detection.simulator.sensors import (
     rays,
     render,
 )
+from fusion.detection.simulator.scene import KINDS, Scene, SceneConfig, build_scene
 
 SCENES = SceneConfig()
 SENSORS = SIZES["tiny"]
 CALIBRATION = nominal_calibration(SENSORS.scale)
-BEAMS = rays(CALIBRATION, SENSORS)
+BEAMS = rays(SENSORS, CALIBRATION)
 N = 8  # frames rendered at once everywhere here, so that one program is compiled
 
 
@@ -56,7 +56,7 @@ def layout(*rows: tuple[str, float, float, float], look_alike: tuple[bool, ...] 
 def scene_of(things: Layout, **changes: np.ndarray) -> Scene:
     """The scene of `things` by day, without hidden cars and without houses, with changed fields."""
     config = dataclasses.replace(SCENES, dark_paint=0.0, low_contrast=0.0, night=0.0)
-    scene = build_scene(np.random.default_rng(4), things, config)
+    scene = build_scene(config, things, rng=np.random.default_rng(4))
     nothing = np.arange(len(scene.kind)) >= len(things)
     bare = scene._replace(
         kind=np.where(nothing, len(KINDS) - 1, scene.kind).astype(np.int32),
@@ -70,14 +70,14 @@ def read(*scenes: Scene) -> list[Readings]:
     padded = [*scenes] + [scenes[-1]] * (N - len(scenes))
     stacked = jax.tree.map(lambda *leaves: np.stack(leaves), *padded)
     keys = jnp.stack([jax.random.key(0)] * N)
-    found = jax.device_get(render(stacked, BEAMS, keys, SENSORS))
+    found = jax.device_get(render(SENSORS, stacked, BEAMS, keys=keys))
     return [Readings(*(leaf[i] for leaf in found)) for i in range(len(scenes))]
 
 
 @pytest.fixture(scope="module")
 def frames() -> list[SimulatedFrame]:
     """Eight frames of the fitted model."""
-    return list(simulate_frames([(i, i, ()) for i in range(N)], SCENES, SENSORS, 0, chunk=N))
+    return list(simulate_frames(SCENES, SENSORS, [(i, i, ()) for i in range(N)], seed=0, chunk=N))
 
 
 def labels(frame: SimulatedFrame) -> Objects:
@@ -262,7 +262,7 @@ def test_each_sensor_sees_what_the_other_does_not() -> None:
 
 
 def test_a_frame_depends_on_its_seed_and_index_only(frames: list[SimulatedFrame]) -> None:
-    (again,) = simulate_frames([(5, 5, ())], SCENES, SENSORS, 0, chunk=N)
+    (again,) = simulate_frames(SCENES, SENSORS, [(5, 5, ())], seed=0, chunk=N)
     for a, b in zip(again.readings, frames[5].readings, strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(frames[4].readings.points, frames[5].readings.points)
@@ -321,9 +321,9 @@ def test_bad_input_is_named(tmp_path: Path) -> None:
         nominal_calibration(0.0)
     with pytest.raises(ValueError, match="2 things in the layout, expected at most 1"):
         build_scene(
-            np.random.default_rng(0),
-            layout(("Car", 0.0, 9.0, 0.0), ("Car", 0.0, 19.0, 0.0)),
             SceneConfig(max_objects=1, max_look_alikes=0),
+            layout(("Car", 0.0, 9.0, 0.0), ("Car", 0.0, 19.0, 0.0)),
+            rng=np.random.default_rng(0),
         )
     with pytest.raises(FileNotFoundError, match="expected a folder"):
         read_layouts(tmp_path / "none")
@@ -339,7 +339,7 @@ def test_layouts_of_real_labels_make_scenes(data_dir: Path) -> None:
     for i in range(len(layouts)):
         room = {"max_objects": SCENES.max_objects, "max_look_alikes": SCENES.max_look_alikes}
         things = compose(rng, layouts[i], layouts[i - 1], **room)
-        scene = build_scene(rng, things, SCENES)
+        scene = build_scene(SCENES, things, rng=rng)
         n = len(things)
         np.testing.assert_allclose(height_above(scene.plane, scene.place[:n]), 0.0, atol=1e-4)
         assert np.isfinite(np.concatenate([leaf.ravel() for leaf in scene])).all()

@@ -13,7 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Int
 
-from fusion.detection.geometry.bev import BevConfig, _cell_index
+from fusion.detection.geometry.bev import BevConfig, cell_index
 
 __all__ = ["AnchorConfig", "Anchors", "anchor_grid", "cluster_sizes", "select_anchors"]
 
@@ -107,14 +107,14 @@ def cluster_sizes(
 
 
 def anchor_grid(
-    plane: Float[Array, "4"], bev: BevConfig, config: AnchorConfig
+    config: AnchorConfig, bev: BevConfig, plane: Float[Array, "4"]
 ) -> Float[Array, "n 6"]:
     """All anchors on the ground plane, nearest row first: rows x columns x sizes x 2 rotations.
 
     Args:
-        plane: ground plane a, b, c, d; the anchors stand on it.
-        bev: the area (static).
         config: static.
+        bev: the area (static).
+        plane: ground plane a, b, c, d; the anchors stand on it.
     """
     half = config.stride / 2
     z = np.arange(bev.z_range[0] + half, bev.z_range[1], config.stride)
@@ -131,15 +131,15 @@ def anchor_grid(
 
 
 def _occupancy(
+    config: AnchorConfig,
+    bev: BevConfig,
     points: Float[Array, "n 3"],
     mask: Bool[Array, "n"],
     plane: Float[Array, "4"],
-    bev: BevConfig,
-    config: AnchorConfig,
 ) -> Int[Array, "rows1 columns1"]:
     """Integral image, with a border of zeros, of the cells that hold points above ground."""
     rows, columns = bev.shape
-    row, column, inside = _cell_index(points, bev)
+    row, column, inside = cell_index(bev, points)
     height = points @ plane[:3] + plane[3]
     low, high = config.occupied_height
     used = mask & inside & (height > low) & (height < high)
@@ -150,12 +150,12 @@ def _occupancy(
 
 
 def select_anchors(
+    config: AnchorConfig,
+    bev: BevConfig,
     grid: Float[Array, "n 6"],
     points: Float[Array, "p 3"],
     mask: Bool[Array, "p"],
     plane: Float[Array, "4"],
-    bev: BevConfig,
-    config: AnchorConfig,
 ) -> Anchors:
     """The anchors of the grid over whose cells there is a point, at a fixed size, inside jit.
 
@@ -163,13 +163,13 @@ def select_anchors(
     are taken evenly from the whole grid, so that the camera can still propose.
 
     Args:
+        config, bev: static.
         grid: `anchor_grid`.
         points, mask: camera-frame points, padded (`pad_points`).
         plane: ground plane.
-        bev, config: static.
     """
     rows, columns = bev.shape
-    total = _occupancy(points, mask, plane, bev, config)
+    total = _occupancy(config, bev, points, mask, plane)
     x, _, z, dx, _, dz = grid.T
 
     def edge(metres: Array, limit: int) -> Array:

@@ -21,7 +21,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-__all__ = ["BevConfig", "bev_maps", "ground_to_unit", "pad_points"]
+__all__ = ["BevConfig", "bev_maps", "cell_index", "ground_to_unit", "pad_points"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -91,9 +91,10 @@ def pad_points(
     return padded, np.arange(size) < n
 
 
-def _cell_index(
-    points: Float[Array, "n 3"], config: BevConfig
+def cell_index(
+    config: BevConfig, points: Float[Array, "n 3"]
 ) -> tuple[Array, Array, Bool[Array, "n"]]:
+    """Row and column of every point, and which points lie in the area."""
     rows, columns = config.shape
     # Subtract before scaling: float32 then puts points on cell borders where float64 does.
     row = jnp.floor((config.z_range[1] - points[:, 2]) / config.cell)
@@ -104,25 +105,25 @@ def _cell_index(
 
 
 def bev_maps(
+    config: BevConfig,
     points: Float[Array, "n 3"],
     mask: Bool[Array, "n"],
     plane: Float[Array, "4"],
-    config: BevConfig,
 ) -> Float[Array, "rows columns channels"]:
     """Height maps and density of one scan, inside jit; `vmap` it for a batch.
 
     Args:
+        config: static.
         points: camera-frame points [m], padded to a fixed number (`pad_points`).
         mask: the points that are real. Points with NaN are left out as well.
         plane: ground plane a, b, c, d.
-        config: static.
 
     Returns:
         `[rows, columns, n_slices + 1]` in [0, 1]; the last channel is the density.
     """
     rows, columns = config.shape
     low, high = config.height_range
-    row, column, inside = _cell_index(points, config)
+    row, column, inside = cell_index(config, points)
     height = points @ plane[:3] + plane[3]
     level = (height - low) * (config.n_slices / (high - low))
     used = mask & inside & (level >= 0) & (level < config.n_slices)
@@ -142,7 +143,7 @@ def bev_maps(
     return maps.reshape(rows, columns, config.n_slices + 1)
 
 
-def ground_to_unit(boxes: Float[Array, "n 4"], config: BevConfig) -> Float[Array, "n 4"]:
+def ground_to_unit(config: BevConfig, boxes: Float[Array, "n 4"]) -> Float[Array, "n 4"]:
     """Ground boxes x1, z1, x2, z2 [m] as y1, x1, y2, x2 in units of the whole map.
 
     0 is the centre of the first row or column and 1 that of the last, as `crop_and_resize` reads

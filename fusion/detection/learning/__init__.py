@@ -1,3 +1,118 @@
 """Examples, losses, training, detection and scoring."""
 
-__all__: list[str] = []
+from fusion.detection.learning.cache import (
+    TESTING,
+    Cache,
+    frame_part,
+    open_cache,
+    prepare_cache,
+    read_example,
+    split_frames,
+    write_example,
+)
+from fusion.detection.learning.checkpoints import Checkpoints
+from fusion.detection.learning.detection_loss import (
+    StageLoss,
+    balanced_class_loss,
+    class_loss,
+    regression_loss,
+    smooth_l1,
+)
+from fusion.detection.learning.examples import (
+    Example,
+    flip,
+    make_example,
+    make_inputs,
+    stack_examples,
+)
+from fusion.detection.learning.fitting import (
+    DetectorFit,
+    fit_detector,
+    frame_order,
+    restore_detector,
+    run_detector,
+    sensor_mask,
+)
+from fusion.detection.learning.gate_objective import (
+    PathLosses,
+    class_losses,
+    gate_terms,
+    path_losses,
+)
+from fusion.detection.learning.inference import detect, to_objects
+from fusion.detection.learning.objective import DetectorLoss, detector_loss
+from fusion.detection.learning.params import DetectorParams
+from fusion.detection.learning.sampling import Assignment, Sample, assign, draw
+from fusion.detection.learning.scoring import (
+    Camera,
+    car_precision,
+    frame_objects,
+    image_scale,
+    precision_fields,
+    weight_auroc,
+)
+from fusion.detection.learning.training import (
+    SENSOR_FAILURES,
+    DetectorState,
+    DetectorTrainConfig,
+    fail_sensor,
+    init_training,
+    learning_rate,
+    train_step,
+    training_inputs,
+)
+
+__all__ = [
+    "SENSOR_FAILURES",
+    "TESTING",
+    "Assignment",
+    "Cache",
+    "Camera",
+    "Checkpoints",
+    "DetectorFit",
+    "DetectorLoss",
+    "DetectorParams",
+    "DetectorState",
+    "DetectorTrainConfig",
+    "Example",
+    "PathLosses",
+    "Sample",
+    "StageLoss",
+    "assign",
+    "balanced_class_loss",
+    "car_precision",
+    "class_loss",
+    "class_losses",
+    "detect",
+    "detector_loss",
+    "draw",
+    "fail_sensor",
+    "fit_detector",
+    "flip",
+    "frame_objects",
+    "frame_order",
+    "frame_part",
+    "gate_terms",
+    "image_scale",
+    "init_training",
+    "learning_rate",
+    "make_example",
+    "make_inputs",
+    "open_cache",
+    "path_losses",
+    "precision_fields",
+    "prepare_cache",
+    "read_example",
+    "regression_loss",
+    "restore_detector",
+    "run_detector",
+    "sensor_mask",
+    "smooth_l1",
+    "split_frames",
+    "stack_examples",
+    "to_objects",
+    "train_step",
+    "training_inputs",
+    "weight_auroc",
+    "write_example",
+]

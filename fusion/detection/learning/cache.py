@@ -16,10 +16,11 @@ from typing import Any
 
 import numpy as np
 
-from fusion.detection.config import CAR_SIZES, DetectorConfig, detector_preset
+from fusion.detection.config import CAR_SIZES, DetectorConfig
 from fusion.detection.geometry.anchors import cluster_sizes
 from fusion.detection.kitti.files import frame_names, read_frame, read_labels, read_split
 from fusion.detection.learning.examples import Example, make_example
+from fusion.detection.presets import preset
 
 __all__ = [
     "TESTING",
@@ -52,7 +53,7 @@ class Cache:
     Attributes:
         folder: where the examples are.
         root: folder of the frames it was made from.
-        preset: of the detector; decides the sizes of all arrays.
+        size: of the detector's preset; decides the sizes of all arrays.
         splits: split name -> frame names.
         sizes: anchor sizes [m], from the training labels.
         counts: frames fitted, skipped, missing; points and labels left out.
@@ -60,14 +61,14 @@ class Cache:
 
     folder: Path
     root: Path
-    preset: str
+    size: str
     splits: dict[str, tuple[str, ...]]
     sizes: tuple[tuple[float, float, float], ...]
     counts: dict[str, Any]
 
     def config(self, model: str) -> DetectorConfig:
-        """The preset of the detector with this cache's anchor sizes."""
-        base = detector_preset(self.preset, model)
+        """The detector of this size with this cache's anchor sizes."""
+        base = preset(self.size, model).config
         return dataclasses.replace(
             base, anchors=dataclasses.replace(base.anchors, sizes=self.sizes)
         )
@@ -187,7 +188,7 @@ def _read_frames(
     for done, (part, name) in enumerate(frames):
         try:
             frame = read_frame(root, name, part=part, any_size=any_size)
-            example, left_out = make_example(frame, config)
+            example, left_out = make_example(config, frame)
         except (ValueError, FileNotFoundError) as error:
             if not skip_bad:
                 raise
@@ -208,7 +209,7 @@ def _skip_key(part: str, name: str) -> str:
 def prepare_cache(
     root: Path,
     folder: Path,
-    preset: str,
+    size: str,
     *,
     splits: Sequence[str] = ("train", "val"),
     add: bool = False,
@@ -221,7 +222,7 @@ def prepare_cache(
     Args:
         root: KITTI folder (`training`, `ImageSets`; `testing` for the split of that name).
         folder: of the cache.
-        preset: of the detector.
+        size: of the detector's preset.
         splits: lists to read; the first one gives the anchor sizes.
         add: add the lists to the cache that is there, whose lists and anchor sizes stay.
         any_size: accept images of other sizes than the benchmark's.
@@ -232,15 +233,15 @@ def prepare_cache(
         FileNotFoundError: a folder, list or (unless `skip_bad`) a file of a frame is missing; or
             there is no cache to add to.
         ValueError: (unless `skip_bad`) a frame is damaged; nothing is left of a split; the cache to
-            add to has another preset or one of the lists; or `testing`, which has no labels, would
+            add to has another size or one of the lists; or `testing`, which has no labels, would
             have to give the anchor sizes.
     """
-    config = detector_preset(preset)
+    config = preset(size).config
     held = open_cache(folder) if add else None
-    if held is not None and (held.preset != preset or set(splits) & set(held.splits)):
+    if held is not None and (held.size != size or set(splits) & set(held.splits)):
         raise ValueError(
-            f"{folder} has preset {held.preset!r} and the splits {', '.join(held.splits)}: cannot "
-            f"add {', '.join(splits)} of preset {preset!r}; prepare all in another cache folder"
+            f"{folder} has size {held.size!r} and the splits {', '.join(held.splits)}: cannot "
+            f"add {', '.join(splits)} of size {size!r}; prepare all in another cache folder"
         )
     if held is None and splits[0] == TESTING:
         raise ValueError(
@@ -266,7 +267,7 @@ def prepare_cache(
         sizes, kept = held.sizes, held.splits | kept
         skipped = held.counts["skipped"] | counts.pop("skipped")
         counts = {k: n + held.counts[k] for k, n in counts.items()} | {"skipped": skipped}
-    cache = Cache(folder, root, preset, kept, sizes, counts)
+    cache = Cache(folder, root, size, kept, sizes, counts)
     record = dataclasses.asdict(cache) | {"folder": str(folder), "root": str(root)}
     temporary = folder / ".cache.json"
     temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
@@ -283,7 +284,7 @@ def open_cache(folder: Path) -> Cache:
     return Cache(
         folder=folder,
         root=Path(held["root"]),
-        preset=held["preset"],
+        size=held.get("size") or held["preset"],  # its name until 0.2
         splits={split: tuple(names) for split, names in held["splits"].items()},
         sizes=tuple((a, b, c) for a, b, c in held["sizes"]),
         counts=held["counts"],

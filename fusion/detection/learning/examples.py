@@ -20,8 +20,9 @@ from fusion.detection.geometry.bev import bev_maps
 from fusion.detection.geometry.planes import fit_plane
 from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
 from fusion.detection.kitti.files import Frame
+from fusion.detection.network.inputs import Inputs
 
-__all__ = ["Example", "Inputs", "flip", "make_example", "make_inputs", "stack_examples"]
+__all__ = ["Example", "flip", "make_example", "make_inputs", "stack_examples"]
 
 MEAN_RGB = (92.84 / 255, 97.80 / 255, 93.58 / 255)  # of the training images (AVOD)
 
@@ -51,27 +52,12 @@ class Example(NamedTuple):
     truth_mask: np.ndarray | Array
 
 
-class Inputs(NamedTuple):
-    """What networks and losses read of one frame (or a batch)."""
-
-    image: Array
-    bev: Array
-    anchors: Array
-    anchor_mask: Array
-    n_occupied: Array
-    p2: Array
-    image_size: Array
-    plane: Array
-    truth: Array
-    truth_mask: Array
-
-
-def make_example(frame: Frame, config: DetectorConfig) -> tuple[Example, dict[str, int | bool]]:
+def make_example(config: DetectorConfig, frame: Frame) -> tuple[Example, dict[str, int | bool]]:
     """Arrays of a frame, and what had to be left out of them.
 
     Args:
-        frame: as read; without a plane file the ground plane is fitted.
         config: gives the sizes.
+        frame: as read; without a plane file the ground plane is fitted.
 
     Returns:
         The example and counts: `plane_fitted`, `points_dropped` (in the image, over `max_points`),
@@ -181,8 +167,8 @@ def flip(
 
 
 def make_inputs(
-    example: Example,
     config: DetectorConfig,
+    example: Example,
     *,
     image: Float[Array, "h w 3"] | None = None,
     points: tuple[Float[Array, "p 4"], Bool[Array, "p"]] | None = None,
@@ -193,8 +179,8 @@ def make_inputs(
     """Maps and anchors of one frame, inside jit.
 
     Args:
-        example: one frame.
         config: static.
+        example: one frame.
         image, points: readings that replace the example's, such as those of a failed sensor; the
             image in [0, 1].
         mirror: flip the frame.
@@ -217,11 +203,11 @@ def make_inputs(
     if key is not None and colour_sd > 0:
         image = image + colour_sd * jax.random.normal(key, (1, 1, 3))
     mask = jnp.asarray(mask)
-    grid = anchor_grid(plane, config.bev, config.anchors)
-    anchors = select_anchors(grid, camera, mask, plane, config.bev, config.anchors)
+    grid = anchor_grid(config.anchors, config.bev, plane)
+    anchors = select_anchors(config.anchors, config.bev, grid, camera, mask, plane)
     return Inputs(
         image=image,
-        bev=bev_maps(camera, mask, plane, config.bev),
+        bev=bev_maps(config.bev, camera, mask, plane),
         anchors=anchors.boxes,
         anchor_mask=anchors.mask,
         n_occupied=anchors.n_occupied,

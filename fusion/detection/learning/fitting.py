@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -18,17 +18,19 @@ import jax.numpy as jnp
 import numpy as np
 
 from fusion.detection.config import DetectorConfig
-from fusion.detection.geometry.proposals import Detections
 from fusion.detection.learning.checkpoints import Checkpoints
-from fusion.detection.learning.detect import detect
-from fusion.detection.learning.examples import Example, Inputs, make_inputs, stack_examples
+from fusion.detection.learning.examples import Example, make_inputs, stack_examples
+from fusion.detection.learning.inference import detect
+from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.training import (
     DetectorState,
-    DetectorTraining,
+    DetectorTrainConfig,
     fail_sensor,
     init_training,
     train_step,
 )
+from fusion.detection.network.inputs import Inputs
+from fusion.detection.network.proposals import Detections
 from fusion.loop import TrainingDiverged
 
 __all__ = [
@@ -48,28 +50,27 @@ class DetectorFit(NamedTuple):
     history: list[dict[str, float]]
 
 
-def restore_detector(
-    folder: Path, config: DetectorConfig, train: DetectorTraining
-) -> DetectorState | None:
+def restore_detector(config: DetectorConfig, folder: Path) -> DetectorState | None:
     """The newest state of a folder of checkpoints; None when there is none."""
     if not folder.is_dir():
         return None
     checkpoints = Checkpoints(folder)
-    held = checkpoints.restore(_init(config, train)(jax.random.key(0)))
+    held = checkpoints.restore(_init(config)(jax.random.key(0)))
     checkpoints.close()
     return None if held is None else held[1]
 
 
-# One compiled program per network serves all seeds and failures of a study.
+# One compiled program per network serves all seeds, rates and failures of a study.
 @functools.lru_cache(maxsize=8)
-def _step(config: DetectorConfig, train: DetectorTraining) -> Callable[..., Any]:
-    return jax.jit(functools.partial(train_step, config=config, train=train), donate_argnums=0)
+def _step(config: DetectorConfig, train: DetectorTrainConfig) -> Callable[..., Any]:
+    step = functools.partial(train_step, config, train)
+    return jax.jit(step, donate_argnames="state")
 
 
 @functools.lru_cache(maxsize=8)
-def _init(config: DetectorConfig, train: DetectorTraining) -> Callable[..., DetectorState]:
+def _init(config: DetectorConfig) -> Callable[..., DetectorState]:
     # Inside jit the forward pass that flax runs to learn the shapes is dead code and costs nothing.
-    return jax.jit(functools.partial(init_training, config=config, train=train))
+    return jax.jit(functools.partial(init_training, config=config))
 
 
 def frame_order(seed: int, n_frames: int, step: int, batch_size: int) -> np.ndarray:
@@ -98,12 +99,13 @@ def _means(rows: Sequence[tuple[Any, Any]]) -> dict[str, float]:
 
 
 def fit_detector(
-    seed: int,
     config: DetectorConfig,
-    train: DetectorTraining,
+    train: DetectorTrainConfig,
+    params: DetectorParams,
     n_frames: int,
     read: Callable[[int], Example],
     *,
+    seed: int = 0,
     report_every: int = 20,
     on_report: Callable[[int, dict[str, float]], None] | None = None,
     checkpoint_dir: Path | None = None,
@@ -113,10 +115,11 @@ def fit_detector(
     """Train a detector.
 
     Args:
-        seed: of parameters, order of frames, failures, mini-batches.
         config, train: static.
+        params: rates and weights; other numbers run the same compiled step.
         n_frames, read: number of training frames, and the example of frame i; called in a thread
             one step ahead.
+        seed: of weights, order of frames, failures, mini-batches.
         report_every: steps between reports; on_report: called with (steps done, means).
         checkpoint_dir, checkpoint_every: where to keep checkpoints, steps between them; the last
             step and an interrupt save too.
@@ -127,9 +130,9 @@ def fit_detector(
         TrainingDiverged: the loss is not finite; the checkpoint before it is kept.
     """
     if n_frames < 1:
-        raise ValueError("n_frames=0: expected at least one training frame")
+        raise ValueError(f"n_frames={n_frames}: expected at least one training frame")
     key = jax.random.key(seed)
-    state = _init(config, train)(jax.random.fold_in(key, 0))
+    state = _init(config)(jax.random.fold_in(key, 0))
     start = 0
     history: list[dict[str, float]] = []
     checkpoints = None if checkpoint_dir is None else Checkpoints(checkpoint_dir)
@@ -140,7 +143,7 @@ def fit_detector(
                 "empty folder"
             )
         start, state, history = held
-    advance = _step(config, train)
+    advance, rates = _step(config, train), params.as_arrays()
     step_key = jax.random.fold_in(key, 1)
 
     def batch(step: int) -> Example:
@@ -155,7 +158,9 @@ def fit_detector(
                 assert ahead is not None
                 examples = ahead.result()
                 ahead = reader.submit(batch, step + 1) if step + 1 < train.steps else None
-                state, terms, failed = advance(state, jax.random.fold_in(step_key, step), examples)
+                state, terms, failed = advance(
+                    rates, state=state, batch=examples, key=jax.random.fold_in(step_key, step)
+                )
                 rows.append((terms, failed))
                 done = step + 1
                 if done % report_every and done < train.steps:
@@ -165,7 +170,7 @@ def fit_detector(
                 if not np.isfinite(row["total"]):
                     raise TrainingDiverged(
                         f"the loss is {row['total']} near step {done}; lower the learning rate "
-                        f"({train.learning_rate:g})"
+                        f"({float(params.learning_rate):g})"
                     )
                 history.append(row)
                 if on_report is not None:
@@ -186,9 +191,9 @@ def fit_detector(
 def _inputs(config: DetectorConfig, failure: str | None) -> Callable[..., Inputs]:
     def run(key: Any, example: Example, severity: Any) -> Inputs:
         if failure is None:
-            inputs = make_inputs(example, config)
+            inputs = make_inputs(config, example)
         else:
-            inputs = fail_sensor(key, example, config, failure, severity)
+            inputs = fail_sensor(config, example, failure, severity, key=key)
         return jax.tree.map(lambda a: a[None], inputs)
 
     return jax.jit(run)
@@ -196,13 +201,13 @@ def _inputs(config: DetectorConfig, failure: str | None) -> Callable[..., Inputs
 
 @functools.lru_cache(maxsize=8)
 def _detect(config: DetectorConfig) -> Callable[..., Detections]:
-    return jax.jit(functools.partial(detect, config=config))
+    return jax.jit(functools.partial(detect, config))
 
 
 def run_detector(
-    state: DetectorState,
     config: DetectorConfig,
-    examples: Sequence[Example],
+    state: DetectorState,
+    examples: Iterable[Example],
     *,
     failure: str | None = None,
     severity: float = 1.0,
@@ -212,9 +217,9 @@ def run_detector(
     """Detections of every frame, on the host.
 
     Args:
-        state: trained.
         config: static.
-        examples: frames.
+        state: trained.
+        examples: frames, taken one at a time.
         failure: of `SENSOR_FAILURES`, the failure of one sensor in every frame; None for none.
         severity: of the failure; seed: of its noise, which depends on the frame's position too.
         on_frame: called with the number of frames done.
@@ -225,7 +230,7 @@ def run_detector(
     out = []
     for i, example in enumerate(examples):
         inputs = read(jax.random.fold_in(key, i), example, jnp.float32(severity))
-        found = run(state.params["main"], state.stats, inputs=inputs)
+        found = run(state.params["main"], state.stats, inputs)
         found = jax.tree.map(lambda a: a[0], found)
         out.append(jax.device_get(found))
         if on_frame is not None:

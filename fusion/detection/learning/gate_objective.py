@@ -20,6 +20,7 @@ what the targets see (`DetectorConfig.auxiliary_second`, `balanced_paths`).
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -33,7 +34,7 @@ from fusion.detection.learning.detection_loss import (
     regression_loss,
 )
 from fusion.detection.learning.sampling import Sample
-from fusion.losses import argate_loss
+from fusion.losses import LossParams, argate_loss
 from fusion.targets import apply_targets
 
 __all__ = ["PathLosses", "class_losses", "gate_terms", "path_losses"]
@@ -53,70 +54,73 @@ class PathLosses(NamedTuple):
     counted: Array
 
 
-def class_losses(scores: Array, sample: Sample, config: DetectorConfig) -> Array:
+def class_losses(config: DetectorConfig, scores: Array, sample: Sample) -> Array:
     """Class loss of every frame `[b]` from the scores of its mini-batch `[b, m, 2]`."""
     return jax.vmap(lambda s, m: class_loss(s, m, config.label_smoothing))(scores, sample)
 
 
 def path_losses(
-    outputs: list[tuple[Array, ...]],
-    wanted: tuple[Array, ...],
-    sample: Sample,
     config: DetectorConfig,
+    outputs: Sequence[tuple[Array, ...]],
+    targets: tuple[Array, ...],
+    sample: Sample,
 ) -> PathLosses:
     """Losses of one stage.
 
     Args:
-        outputs: of each view, class scores `[b, m, 2]`, then offsets, then (second stage) headings.
-        wanted: what offsets and headings should be.
-        sample: mini-batch of every frame.
         config: weights of the parts.
+        outputs: of each view, class scores `[b, m, 2]`, then offsets, then (second stage) headings.
+        targets: what offsets and headings should be.
+        sample: mini-batch of every frame.
     """
     scales = (config.regression_weight, config.angle_weight)
     regress = jax.vmap(regression_loss)
     whole, balanced = [], []
     for scores, *predicted in outputs:
         parts = [
-            scale * regress(p, w, sample)
-            for scale, p, w in zip(scales, predicted, wanted, strict=False)
+            scale * regress(p, t, sample)
+            for scale, p, t in zip(scales, predicted, targets, strict=False)
         ]
-        told = jax.vmap(balanced_class_loss)(scores, sample)
-        classes = told if config.balanced_paths else class_losses(scores, sample, config)
+        even = jax.vmap(balanced_class_loss)(scores, sample)
+        classes = even if config.balanced_paths else class_losses(config, scores, sample)
         whole.append(classes + sum(parts))
-        balanced.append(told)
+        balanced.append(even)
     counted = sample.positive.any(axis=1).astype(jnp.float32)
     return PathLosses(jnp.stack(whole, 1), jnp.stack(balanced, 1), counted)
 
 
 def gate_terms(
-    params: Any, config: DetectorConfig, weights: Array, stages: list[PathLosses]
+    config: DetectorConfig,
+    gate: LossParams,
+    params: Any,
+    weights: Array,
+    stages: Sequence[PathLosses],
 ) -> tuple[Array, Array, Array]:
     """The gate's part of the loss, its auxiliary and its regularization term; scalars.
 
     Args:
-        params: of `init_detector`, for the lattice and the usual losses.
         config: static.
+        gate: alpha, beta, tau, anchor.
+        params: of `init_detector`, for the lattice and the running means of the losses.
         weights: `[b, k]` fusion weights.
         stages: losses of each stage.
     """
     options = dataclasses.replace(config.gate_loss, normalizer=config.normalizer)
     aux_losses = sum((stage.whole for stage in stages[1:]), stages[0].whole)
-    seen, counted, habit = aux_losses, None, jnp.zeros(())
+    given, counted, tracking = aux_losses, None, jnp.zeros(())
     if config.balanced_paths:
-        told = jnp.mean(jnp.stack([stage.balanced for stage in stages]), axis=0)
+        balanced = jnp.mean(jnp.stack([stage.balanced for stage in stages]), axis=0)
         counted = jnp.prod(jnp.stack([stage.counted for stage in stages]), axis=0)
-        # The average is learned beside the lattice: it minimizes the squared distance.
-        usual, now = params["usual_losses"][None], jax.lax.stop_gradient(told)
-        habit = jnp.mean(counted * 0.5 * jnp.sum((usual - now) ** 2, axis=-1))
-        seen = 1.0 + told - jax.lax.stop_gradient(usual)
-    seen = jax.lax.stop_gradient(seen) if options.stop_targets else seen
+        # The mean is learned beside the lattice: it minimizes the squared distance.
+        mean, now = params["mean_losses"][None], jax.lax.stop_gradient(balanced)
+        tracking = jnp.mean(counted * 0.5 * jnp.sum((mean - now) ** 2, axis=-1))
+        given = 1.0 + balanced - jax.lax.stop_gradient(mean)
+    given = jax.lax.stop_gradient(given) if options.stop_targets else given
     targets = None
     if options.learned_targets:
-        targets = apply_targets(config.targets, params["targets"], seen)
+        targets = apply_targets(config.targets, params["targets"], given)
     # The cross entropy of a single class is zero: what is left are the terms of the gate.
     none = jnp.zeros((weights.shape[0], 1))
     labels = jnp.zeros(weights.shape[0], jnp.int32)
-    terms = argate_loss(
-        options, config.gate_params, none, labels, weights, aux_losses, targets, seen, counted
-    )
-    return terms.total + habit, terms.auxiliary, terms.regularization
+    terms = argate_loss(options, gate, none, labels, weights, aux_losses, targets, given, counted)
+    return terms.total + tracking, terms.auxiliary, terms.regularization

@@ -5,8 +5,7 @@ r"""What training minimizes: the losses of both stages, and the gate's of Equati
       + \alpha \sum_k w_k L^{aux}_k + \beta \sum_k \big(w_k - f_k(L^{aux})\big)^2 + \dots
 
 :math:`L^{aux}_k` is the loss of both stages of a path that reads view k alone. `avod` has the first
-five terms. See
-`gate_objective` for the last three.
+five terms. See `gate_objective` for the last three.
 
 Source: Ku et al. (2018), section III-E; Shim (2020), Eq. 3.2 and section 3.3.2.2.
 """
@@ -28,17 +27,24 @@ from fusion.detection.geometry.encodings import (
     decode_offsets,
     encode_offsets,
 )
-from fusion.detection.geometry.proposals import anchor_boxes, propose, view_boxes
 from fusion.detection.learning.detection_loss import regression_loss
-from fusion.detection.learning.examples import Inputs
 from fusion.detection.learning.gate_objective import (
     PathLosses,
     class_losses,
     gate_terms,
     path_losses,
 )
+from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.sampling import assign, draw
-from fusion.detection.network.detector import AuxiliaryHeads, Detector, Encoded, crop_views, fuse
+from fusion.detection.network.detector import AuxiliaryHeads
+from fusion.detection.network.forward import (
+    encode,
+    propose_boxes,
+    score_anchors,
+    score_proposals,
+)
+from fusion.detection.network.inputs import Inputs
+from fusion.detection.network.proposals import anchor_boxes
 from fusion.gating import drop_modalities
 
 __all__ = ["DetectorLoss", "detector_loss"]
@@ -101,16 +107,20 @@ def _with_truth(
     return jnp.concatenate([proposals, shifted], 1), jnp.concatenate([found, mask], 1)
 
 
-def _encode(params: Any, stats: Any, config: DetectorConfig, inputs: Inputs) -> tuple[Encoded, Any]:
-    variables = {"params": params["main"], "batch_stats": stats}
-    encoded, changed = Detector(config).apply(
-        variables, inputs.image, inputs.bev, True, method="encode", mutable=["batch_stats"]
-    )
-    return encoded, changed.get("batch_stats", {})
+def _assign(boxes: Array, mask: Array, truth: Array, inputs: Inputs, limits: Any) -> Any:
+    """Which boxes of every frame are objects."""
+    one = jax.vmap(lambda a, m, t, tm: assign(anchor_ground(a), m, t, tm, limits))
+    return one(boxes, mask, truth, inputs.truth_mask)
 
 
 def detector_loss(
-    params: Any, stats: Any, config: DetectorConfig, inputs: Inputs, key: PRNGKeyArray
+    config: DetectorConfig,
+    hyper: DetectorParams,
+    params: Any,
+    stats: Any,
+    inputs: Inputs,
+    *,
+    key: PRNGKeyArray,
 ) -> tuple[Array, tuple[DetectorLoss, Any]]:
     """Training loss of a batch of frames, its terms, and the new statistics of batch norm.
 
@@ -118,83 +128,70 @@ def detector_loss(
     alone, which are cut out once more. So a step costs little more than the two pyramids.
 
     Args:
+        config: static.
+        hyper: weights of the gate's terms.
         params: of `init_detector`; differentiable.
         stats: of batch norm.
-        config: static.
         inputs: batch of frames.
         key: of mini-batches, dropout and path drop.
     """
     c, b = config, inputs.image.shape[0]
-    model: Any = Detector(config)
-    stop = jax.lax.stop_gradient
     path_key, rpn_key, second_key, jitter_key, drop1, drop2, drop3 = jax.random.split(key, 7)
     drop4 = jax.random.fold_in(drop2, 1)
-    main = {"params": params["main"]}
-    encoded, new_stats = _encode(params, stats, config, inputs)
+    main = params["main"]
+    encoded, new_stats = encode(c, main, stats, inputs, train=True)
     kept = drop_modalities(path_key, jnp.ones((2, b, 1)), c.path_drop)[:, :, 0].T
     scale = 2.0 * encoded.weights * kept
     truth = _safe_truth(inputs)
     truth_anchors = jax.vmap(lambda t: box3d_to_anchor(t, square=True))(truth)
     truth_ground = jax.vmap(anchor_ground)(truth_anchors)
-    locate = jax.vmap(lambda a, p, s: view_boxes(a, p, s, config))
 
     # First stage: proposals of all anchors, losses of a mini-batch.
-    places = locate(inputs.anchors, inputs.p2, inputs.image_size)
-    crops = crop_views(stop(encoded.maps), places, c.rpn_crop)
-    scored = model.apply(stop(main), fuse(crops, stop(scale)), False, method="first_stage")
-    proposals, found = jax.vmap(lambda a, m, o, d: propose(a, m, o, d, c, c.proposals_train))(
-        inputs.anchors, inputs.anchor_mask, *scored
+    proposals, found = propose_boxes(c, main, encoded, scale, inputs, c.proposals_train)
+    assigned = _assign(inputs.anchors, inputs.anchor_mask, truth_ground, inputs, c.rpn_iou)
+    sample = jax.vmap(lambda k, a: draw(a, c.rpn_batch, key=k))(
+        jax.random.split(rpn_key, b), assigned
     )
-    assigned = jax.vmap(lambda a, m, t, tm: assign(anchor_ground(a), m, t, tm, c.rpn_iou))(
-        inputs.anchors, inputs.anchor_mask, truth_ground, inputs.truth_mask
-    )
-    sample = jax.vmap(lambda k, a: draw(k, a, c.rpn_batch))(jax.random.split(rpn_key, b), assigned)
     match = _take(assigned.match, sample.indices)
-    target = jax.vmap(encode_offsets)(
-        _take(inputs.anchors, sample.indices), _take(truth_anchors, match)
-    )
-    places = (_take(places[0], sample.indices), _take(places[1], sample.indices))
-    crops = crop_views(encoded.maps, places, c.rpn_crop)
-    scores, offsets = model.apply(
-        main, fuse(crops, scale), True, method="first_stage", rngs={"dropout": drop1}
-    )
-    rpn_classes = class_losses(scores, sample, c)
+    anchors = _take(inputs.anchors, sample.indices)
+    target = jax.vmap(encode_offsets)(anchors, _take(truth_anchors, match))
+    crops, (scores, offsets) = score_anchors(c, main, encoded, scale, inputs, anchors, key=drop1)
+    rpn_classes = class_losses(c, scores, sample)
     rpn_boxes = jax.vmap(regression_loss)(offsets, target, sample)
     paths: list[PathLosses] = []
-    alone: Any = AuxiliaryHeads(c)
+    heads: Any = AuxiliaryHeads(c)
     if c.model == "avod_argate":
-        held = {"params": params["auxiliary"]}
-        heads = alone.apply(held, crops, True, method="first_stage", rngs={"dropout": drop2})
-        paths.append(path_losses(heads, (target,), sample, c))
+        auxiliary = {"params": params["auxiliary"]}
+        outputs = heads.apply(auxiliary, crops, True, method="first_stage", rngs={"dropout": drop2})
+        paths.append(path_losses(c, outputs, (target,), sample))
 
     # Second stage: a mini-batch of proposals.
     proposals, found = _with_truth(
-        jitter_key, stop(proposals), found, truth_anchors, inputs, c.truth_proposals
+        jitter_key, proposals, found, truth_anchors, inputs, c.truth_proposals
     )
-    assigned = jax.vmap(lambda a, m, t, tm: assign(anchor_ground(a), m, t, tm, c.second_iou))(
-        proposals, found, truth_ground, inputs.truth_mask
-    )
-    sample2 = jax.vmap(lambda k, a: draw(k, a, c.second_batch))(
+    assigned = _assign(proposals, found, truth_ground, inputs, c.second_iou)
+    sample2 = jax.vmap(lambda k, a: draw(a, c.second_batch, key=k))(
         jax.random.split(second_key, b), assigned
     )
     rois, match = _take(proposals, sample2.indices), _take(assigned.match, sample2.indices)
-    crops = crop_views(encoded.features, locate(rois, inputs.p2, inputs.image_size), c.second_crop)
-    scores, offsets, angle = model.apply(
-        main, fuse(crops, scale), True, method="second_stage", rngs={"dropout": drop3}
+    crops, (scores, offsets, angle) = score_proposals(
+        c, main, encoded, scale, inputs, rois, key=drop3
     )
     corners = jax.vmap(box3d_to_box4c)
-    wanted = _take(corners(truth, inputs.plane), match)
-    wanted = wanted - corners(jax.vmap(anchor_boxes)(rois), inputs.plane)
+    moves = _take(corners(truth, inputs.plane), match)
+    moves = moves - corners(jax.vmap(anchor_boxes)(rois), inputs.plane)
     heading = jax.vmap(angle_vector)(_take(truth[..., 6:], match)[..., 0])
-    classes = class_losses(scores, sample2, c)
-    boxes = jax.vmap(regression_loss)(offsets, wanted, sample2)
+    classes = class_losses(c, scores, sample2)
+    boxes = jax.vmap(regression_loss)(offsets, moves, sample2)
     angles = jax.vmap(regression_loss)(angle, heading, sample2)
-    gate = auxiliary = regularization = jnp.zeros(())
+    gate = of_paths = regularization = jnp.zeros(())
     if c.model == "avod_argate":
         if c.auxiliary_second:
-            heads = alone.apply(held, crops, True, method="second_stage", rngs={"dropout": drop4})
-            paths.append(path_losses(heads, (wanted, heading), sample2, c))
-        gate, auxiliary, regularization = gate_terms(params, c, encoded.weights, paths)
+            outputs = heads.apply(
+                auxiliary, crops, True, method="second_stage", rngs={"dropout": drop4}
+            )
+            paths.append(path_losses(c, outputs, (moves, heading), sample2))
+        gate, of_paths, regularization = gate_terms(c, hyper.gate, params, encoded.weights, paths)
 
     frames = (
         rpn_classes
@@ -206,7 +203,7 @@ def detector_loss(
     total = frames.mean() + gate
     terms = DetectorLoss(
         total, rpn_classes.mean(), rpn_boxes.mean(), classes.mean(), boxes.mean(), angles.mean(),
-        auxiliary, regularization,
+        of_paths, regularization,
         sample.positive.sum(axis=1).astype(jnp.float32).mean(),
         sample2.positive.sum(axis=1).astype(jnp.float32).mean(),
         encoded.weights,

@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from fusion.detection.geometry.nms import pairwise
+from fusion.detection.geometry.suppression import pairwise
 
 __all__ = ["Assignment", "Sample", "assign", "draw"]
 
@@ -55,20 +55,20 @@ def assign(
     )
 
 
-def draw(key: PRNGKeyArray, assignment: Assignment, size: int) -> Sample:
+def draw(assignment: Assignment, size: int, *, key: PRNGKeyArray) -> Sample:
     """A random mini-batch, at most half of it positive, filled up with negatives.
 
     Args:
-        key: of the draw.
         assignment: of n boxes.
         size: of the mini-batch (static); smaller when there are fewer boxes.
+        key: of the draw.
     """
     n = assignment.match.shape[0]
     size = min(size, n)
-    luck = jax.random.uniform(key, (n,), minval=0.01)
-    lucky = jnp.where(assignment.positive, luck, 0.0)
-    least = jax.lax.top_k(lucky, max(1, size // 2))[0][-1]
-    kept = assignment.positive & (lucky >= least)
-    order = jnp.where(kept, 1.0 + luck, jnp.where(assignment.negative, luck, 0.0))
+    priority = jax.random.uniform(key, (n,), minval=0.01)
+    of_positives = jnp.where(assignment.positive, priority, 0.0)
+    least = jax.lax.top_k(of_positives, max(1, size // 2))[0][-1]
+    kept = assignment.positive & (of_positives >= least)
+    order = jnp.where(kept, 1.0 + priority, jnp.where(assignment.negative, priority, 0.0))
     rank, indices = jax.lax.top_k(order, size)
     return Sample(indices, rank > 1.0, rank > 0.0)

@@ -4,18 +4,25 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from typing import NamedTuple
 
 import numpy as np
 from jaxtyping import Float
 
-from fusion.detection.geometry.proposals import Detections
 from fusion.detection.kitti.average_precision import DIFFICULTIES, METRICS, Evaluation, evaluate
 from fusion.detection.kitti.objects import Objects
-from fusion.detection.learning.detect import to_objects
-from fusion.detection.learning.examples import Example
+from fusion.detection.learning.inference import to_objects
+from fusion.detection.network.proposals import Detections
 from fusion.evaluate import auroc
 
-__all__ = ["car_precision", "frame_objects", "image_scale", "precision_fields", "weight_auroc"]
+__all__ = [
+    "Camera",
+    "car_precision",
+    "frame_objects",
+    "image_scale",
+    "precision_fields",
+    "weight_auroc",
+]
 
 _KITTI_WIDTH, _NARROWEST = 1242.0, 1000.0
 
@@ -30,11 +37,18 @@ def image_scale(width: float) -> float:
     return 1.0 if width >= _NARROWEST else _KITTI_WIDTH / width
 
 
-def frame_objects(detections: Sequence[Detections], examples: Sequence[Example]) -> list[Objects]:
+class Camera(NamedTuple):
+    """What a frame's detections are projected with: P2 `[3, 4]`, rows and columns of the image."""
+
+    p2: np.ndarray
+    image_size: np.ndarray
+
+
+def frame_objects(detections: Sequence[Detections], cameras: Sequence[Camera]) -> list[Objects]:
     """Detections of each frame in KITTI's terms, in pixels of the frame's own image."""
     return [
-        to_objects(found, np.asarray(example.p2), np.asarray(example.image_size))
-        for found, example in zip(detections, examples, strict=True)
+        to_objects(found, np.asarray(camera.p2), np.asarray(camera.image_size))
+        for found, camera in zip(detections, cameras, strict=True)
     ]
 
 

@@ -14,29 +14,32 @@ import optax
 from jaxtyping import Array, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
-from fusion.detection.learning.examples import Example, Inputs, make_inputs
+from fusion.detection.learning.examples import Example, make_inputs
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
-from fusion.detection.learning.sensor_failures import (
+from fusion.detection.learning.params import DetectorParams
+from fusion.detection.network.detector import init_detector
+from fusion.detection.network.inputs import Inputs
+from fusion.detection.sensors.camera_failures import (
     CAMERA_FAILURES,
-    LIDAR_FAILURES,
     camera_failure,
-    lidar_failure,
     random_camera_failure,
+)
+from fusion.detection.sensors.lidar_failures import (
+    LIDAR_FAILURES,
+    lidar_failure,
     random_lidar_failure,
 )
-from fusion.detection.network.detector import init_detector
 from fusion.targets import project_targets
 
 __all__ = [
     "SENSOR_FAILURES",
     "DetectorState",
-    "DetectorTraining",
+    "DetectorTrainConfig",
     "fail_sensor",
     "init_training",
     "learning_rate",
     "train_step",
     "training_inputs",
-    "training_preset",
 ]
 
 SENSOR_FAILURES: tuple[str, ...] = (
@@ -47,18 +50,13 @@ SENSOR_FAILURES: tuple[str, ...] = (
 
 
 @dataclasses.dataclass(frozen=True)
-class DetectorTraining:
-    """How the detector is trained; the defaults are the source's.
+class DetectorTrainConfig:
+    """How the detector is trained, static; the defaults are the source's.
 
     Attributes:
         steps, batch_size: length of the training and frames a step.
-        learning_rate, schedule: `staircase` multiplies by 0.8 every 30,000 steps, `cosine` falls
-            to zero after a warm-up over the first 5 %.
-        l2, l2_dense: weight of the squared parameters of convolutions and first stage, and of the
-            second stage's dense layers.
-        clip_norm: bound of the gradient's norm, lattice aside.
-        target_rate: factor of the learning rate for the lattice of the targets, a few numbers that
-            have to keep up with the losses of the paths.
+        schedule: of the learning rate; `staircase` multiplies by 0.8 every 30,000 steps, `cosine`
+            falls to zero after a warm-up over the first 5 %.
         flip: mirror half of the frames; colour_sd: shift of the colour channels.
         failure_share: frames in which one sensor fails (half camera, half lidar); the source keeps
             a third clean in its other experiments.
@@ -68,12 +66,7 @@ class DetectorTraining:
 
     steps: int = 120_000
     batch_size: int = 1
-    learning_rate: float = 1e-4
     schedule: Literal["staircase", "cosine"] = "staircase"
-    l2: float = 5e-4
-    l2_dense: float = 5e-3
-    clip_norm: float = 10.0
-    target_rate: float = 10.0
     flip: bool = True
     colour_sd: float = 0.02
     failure_share: float = 0.0
@@ -86,6 +79,10 @@ class DetectorTraining:
             raise ValueError(
                 f"steps={self.steps}, batch_size={self.batch_size}: expected at least 1"
             )
+        if self.schedule not in ("staircase", "cosine"):
+            raise ValueError(f"schedule={self.schedule!r}: expected 'staircase' or 'cosine'")
+        if not 0 <= self.colour_sd < 1:
+            raise ValueError(f"colour_sd={self.colour_sd}: expected a standard deviation in [0, 1)")
         if not (0 <= self.failure_share <= 1 and 0 < self.severity <= 1):
             raise ValueError(
                 f"failure_share={self.failure_share}, severity={self.severity}: expected shares "
@@ -93,7 +90,9 @@ class DetectorTraining:
             )
         unknown = [kind for kind in self.failure_kinds if kind not in SENSOR_FAILURES]
         if unknown:
-            raise ValueError(f"failure {unknown[0]!r}, expected of {', '.join(SENSOR_FAILURES)}")
+            raise ValueError(
+                f"failure_kinds={unknown[0]!r}: expected of {', '.join(SENSOR_FAILURES)}"
+            )
         sensors = {kind.partition("_")[0] for kind in self.failure_kinds}
         if self.failure_share > 0 and sensors != {"camera", "lidar"}:
             raise ValueError(
@@ -111,17 +110,17 @@ class DetectorState(NamedTuple):
     step: Array
 
 
-def learning_rate(train: DetectorTraining, step: Array) -> Array:
+def learning_rate(train: DetectorTrainConfig, hyper: DetectorParams, step: Array) -> Array:
     """The learning rate of a step."""
     at = step.astype(jnp.float32)
     if train.schedule == "staircase":
-        return train.learning_rate * 0.8 ** jnp.floor(at / 30_000)
+        return hyper.learning_rate * 0.8 ** jnp.floor(at / 30_000)
     warm = jnp.minimum(1.0, (at + 1) / max(1.0, 0.05 * train.steps))
     phase = jnp.minimum(1.0, at / train.steps)
-    return train.learning_rate * warm * 0.5 * (1.0 + jnp.cos(jnp.pi * phase))
+    return hyper.learning_rate * warm * 0.5 * (1.0 + jnp.cos(jnp.pi * phase))
 
 
-def _l2(train: DetectorTraining, params: Any) -> Any:
+def _l2(hyper: DetectorParams, params: Any) -> Any:
     """Decay of every parameter: kernels only; the lattice holds targets, not weights."""
 
     def decay(path: Any, _: Array) -> float:
@@ -135,58 +134,59 @@ def _l2(train: DetectorTraining, params: Any) -> Any:
 
 def _parts(params: Any) -> dict[str, str]:
     """Which optimizer moves what."""
-    beside = ("targets", "usual_losses")
+    beside = ("targets", "mean_losses")
     return {name: "targets" if name in beside else "network" for name in params}
 
 
-def _optimizer(train: DetectorTraining) -> optax.GradientTransformation:
-    clip = optax.clip_by_global_norm(train.clip_norm)
+def _optimizer(hyper: DetectorParams) -> optax.GradientTransformation:
+    clip = optax.clip_by_global_norm(hyper.clip_norm)  # type: ignore[arg-type]
     parts = {
         "network": optax.chain(clip, optax.scale_by_adam()),
-        "targets": optax.chain(optax.scale_by_adam(), optax.scale(train.target_rate)),
+        "targets": optax.chain(optax.scale_by_adam(), optax.scale(hyper.target_rate)),
     }
     return optax.partition(parts, _parts)
 
 
-def init_training(
-    key: PRNGKeyArray, config: DetectorConfig, train: DetectorTraining
-) -> DetectorState:
-    """Fresh parameters and optimizer."""
+def init_training(key: PRNGKeyArray, config: DetectorConfig) -> DetectorState:
+    """Fresh parameters and optimizer, whose state depends on no rate."""
     params, stats = init_detector(key, config)
-    return DetectorState(params, stats, _optimizer(train).init(params), jnp.zeros((), jnp.int32))
+    optimizer = _optimizer(DetectorParams())
+    return DetectorState(params, stats, optimizer.init(params), jnp.zeros((), jnp.int32))
 
 
 def fail_sensor(
-    key: PRNGKeyArray,
-    example: Example,
     config: DetectorConfig,
+    example: Example,
     failure: str,
     severity: float | Array = 1.0,
+    *,
+    key: PRNGKeyArray,
 ) -> Inputs:
     """Inputs of one frame of which one sensor has failed, for tests of robustness.
 
     Args:
-        key: of the failure's noise.
-        example: one frame.
         config: static.
+        example: one frame.
         failure: of `SENSOR_FAILURES` (static).
         severity: in [0, 1].
+        key: of the failure's noise.
 
     Raises:
         ValueError: unknown failure.
     """
     if failure not in SENSOR_FAILURES:
-        raise ValueError(f"failure {failure!r}, expected one of {', '.join(SENSOR_FAILURES)}")
+        raise ValueError(f"failure={failure!r}: expected one of {', '.join(SENSOR_FAILURES)}")
     sensor, _, kind = failure.partition("_")
     if sensor == "camera":
         image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
-        return make_inputs(example, config, image=camera_failure(key, image, kind, severity))
+        return make_inputs(config, example, image=camera_failure(image, kind, severity, key=key))
     points, mask = jnp.asarray(example.points), jnp.asarray(example.point_mask)
-    return make_inputs(example, config, points=lidar_failure(key, points, mask, kind, severity))
+    failed = lidar_failure(points, mask, kind, severity, key=key)
+    return make_inputs(config, example, points=failed)
 
 
 def training_inputs(
-    key: PRNGKeyArray, example: Example, config: DetectorConfig, train: DetectorTraining
+    config: DetectorConfig, train: DetectorTrainConfig, example: Example, *, key: PRNGKeyArray
 ) -> tuple[Inputs, Array]:
     """Inputs of one training frame, and which of (camera, lidar) fails in it `[2]`."""
     which, strength, noise, mirror, colour = jax.random.split(key, 5)
@@ -201,17 +201,17 @@ def training_inputs(
             kinds[name.partition("_")[0]].append(name.partition("_")[2])
         image = jax.lax.cond(
             failed[0],
-            lambda: random_camera_failure(noise, image, severity, kinds=kinds["camera"]),
+            lambda: random_camera_failure(image, severity, kinds=kinds["camera"], key=noise),
             lambda: image,
         )
         points, mask = jax.lax.cond(
             failed[1],
-            lambda: random_lidar_failure(noise, points, mask, severity, kinds=kinds["lidar"]),
+            lambda: random_lidar_failure(points, mask, severity, kinds=kinds["lidar"], key=noise),
             lambda: (points, mask),
         )
     inputs = make_inputs(
-        example,
         config,
+        example,
         image=image,
         points=(points, mask),
         mirror=jax.random.bernoulli(mirror) if train.flip else None,
@@ -222,21 +222,24 @@ def training_inputs(
 
 
 def train_step(
-    state: DetectorState,
-    key: PRNGKeyArray,
-    batch: Example,
     config: DetectorConfig,
-    train: DetectorTraining,
+    train: DetectorTrainConfig,
+    hyper: DetectorParams,
+    state: DetectorState,
+    batch: Example,
+    *,
+    key: PRNGKeyArray,
 ) -> tuple[DetectorState, DetectorLoss, Array]:
     r"""One step of Adam with L2, then the projection of the lattice.
 
     .. math:: \theta \leftarrow \Pi(\theta - \eta \, \mathrm{Adam}(\nabla L + \lambda \theta))
 
     Args:
-        state: as from `init_training`.
-        key: of this step; the frames' failures and flips do not depend on the model.
-        batch: examples with a leading axis.
         config, train: static.
+        hyper: rates and weights; another value compiles nothing anew.
+        state: as from `init_training`.
+        batch: examples with a leading axis.
+        key: of this step; the frames' failures and flips do not depend on the model.
 
     Returns:
         the new state, the terms of the loss, and which sensors failed `[b, 2]`.
@@ -245,37 +248,16 @@ def train_step(
     keys = jax.random.split(input_key, batch.image.shape[0])
     # One frame after the other: under vmap every kind of failure would be computed each time.
     inputs, failed = jax.lax.map(
-        lambda a: training_inputs(a[0], a[1], config, train), (keys, batch)
+        lambda a: training_inputs(config, train, a[1], key=a[0]), (keys, batch)
     )
-    gradient = jax.value_and_grad(detector_loss, has_aux=True)
-    (_, (terms, stats)), grads = gradient(state.params, state.stats, config, inputs, loss_key)
-    decayed = jax.tree.map(lambda g, p, d: g + d * p, grads, state.params, _l2(train, grads))
-    updates, opt_state = _optimizer(train).update(decayed, state.opt_state, state.params)
-    rate = learning_rate(train, state.step)
+    gradient = jax.value_and_grad(detector_loss, argnums=2, has_aux=True)
+    (_, (terms, stats)), grads = gradient(
+        config, hyper, state.params, state.stats, inputs, key=loss_key
+    )
+    decayed = jax.tree.map(lambda g, p, d: g + d * p, grads, state.params, _l2(hyper, grads))
+    updates, opt_state = _optimizer(hyper).update(decayed, state.opt_state, state.params)
+    rate = learning_rate(train, hyper, state.step)
     params = jax.tree.map(lambda p, u: p - rate * u, state.params, updates)
     if "targets" in params:
         params["targets"] = project_targets(config.targets, params["targets"])
     return DetectorState(params, stats, opt_state, state.step + 1), terms, failed
-
-
-def training_preset(name: str) -> DetectorTraining:
-    """How a preset of the detector is trained.
-
-    Args:
-        name: `paper`, the source's; `small`, short on two CPU cores; `tiny`, for tests.
-
-    Raises:
-        ValueError: unknown name.
-    """
-    presets = {
-        "paper": DetectorTraining(),
-        "small": DetectorTraining(
-            steps=2000, learning_rate=2e-3, schedule="cosine", l2=1e-5, l2_dense=1e-5
-        ),
-        "tiny": DetectorTraining(
-            steps=20, learning_rate=3e-3, schedule="cosine", l2=0.0, l2_dense=0.0
-        ),
-    }
-    if name not in presets:
-        raise ValueError(f"preset={name!r}, expected one of {', '.join(presets)}")
-    return presets[name]

@@ -1,3 +1,65 @@
-"""The two-stage detector as flax modules."""
+"""The two-stage detector as flax modules, and the way through it."""
 
-__all__: list[str] = []
+from fusion.detection.network.convolution import convolve
+from fusion.detection.network.crop import crop_and_resize
+from fusion.detection.network.detector import (
+    AuxiliaryHeads,
+    Detector,
+    Encoded,
+    count_main_parameters,
+    crop_views,
+    fuse,
+    init_detector,
+)
+from fusion.detection.network.forward import (
+    Scored,
+    encode,
+    propose_boxes,
+    score_anchors,
+    score_proposals,
+)
+from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
+from fusion.detection.network.heads import MapGate, RpnHead, SecondHead
+from fusion.detection.network.initialize import draw_weights
+from fusion.detection.network.inputs import Inputs
+from fusion.detection.network.proposals import (
+    Detections,
+    anchor_boxes,
+    decode_second,
+    final_boxes,
+    propose,
+    view_boxes,
+)
+from fusion.detection.network.views import FeaturePyramid, TransposedConv
+
+__all__ = [
+    "GROUP_SIZE",
+    "AuxiliaryHeads",
+    "Detections",
+    "Detector",
+    "Encoded",
+    "FeaturePyramid",
+    "Inputs",
+    "MapGate",
+    "RpnHead",
+    "Scored",
+    "SecondHead",
+    "TransposedConv",
+    "anchor_boxes",
+    "convolve",
+    "count_main_parameters",
+    "crop_and_resize",
+    "crop_views",
+    "decode_second",
+    "draw_weights",
+    "encode",
+    "final_boxes",
+    "fuse",
+    "group_norm_relu",
+    "init_detector",
+    "propose",
+    "propose_boxes",
+    "score_anchors",
+    "score_proposals",
+    "view_boxes",
+]

@@ -160,7 +160,7 @@ def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
     """Fresh parameters and the statistics of batch norm (empty with group norm).
 
     Parameters are `main` and, for `avod_argate`, those that training alone needs: `auxiliary`
-    (the paths of the views), `targets` (the lattice), `usual_losses` (of the paths).
+    (the paths of the views), `targets` (the lattice), `mean_losses` (of the paths).
     """
     main_key, aux_key, target_key = jax.random.split(key, 3)
 
@@ -178,7 +178,7 @@ def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
         )
         params["auxiliary"] = heads["params"]
         params["targets"] = init_targets(target_key, config.targets, 2)
-        params["usual_losses"] = jnp.full(2, math.log(2.0), jnp.float32)
+        params["mean_losses"] = jnp.full(2, math.log(2.0), jnp.float32)
     return params, variables.get("batch_stats", {})
 
 

@@ -7,8 +7,7 @@ from fusion.detection.simulator.layouts import (
     generated_layout,
     read_layouts,
 )
-from fusion.detection.simulator.scene import KINDS, LABELLED, Scene, SceneConfig, build_scene
-from fusion.detection.simulator.sensors import (
+from fusion.detection.simulator.rendering import (
     SIZES,
     Rays,
     Readings,
@@ -17,6 +16,7 @@ from fusion.detection.simulator.sensors import (
     rays,
     render,
 )
+from fusion.detection.simulator.scene import KINDS, LABELLED, Scene, SceneConfig, build_scene
 
 __all__ = [
     "KINDS",

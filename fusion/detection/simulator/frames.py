@@ -25,14 +25,14 @@ from fusion.detection.kitti.files import (
 )
 from fusion.detection.simulator.labels import Visibility, labels_of, visibility_of
 from fusion.detection.simulator.layouts import Layout, compose, generated_layout
-from fusion.detection.simulator.scene import Scene, SceneConfig, build_scene
-from fusion.detection.simulator.sensors import (
+from fusion.detection.simulator.rendering import (
     Readings,
     SensorConfig,
     nominal_calibration,
     rays,
     render,
 )
+from fusion.detection.simulator.scene import Scene, SceneConfig, build_scene
 
 __all__ = [
     "VISIBILITY_COLUMNS",
@@ -90,15 +90,15 @@ def split_layouts(
 
 
 def draw_scene(
-    index: int, position: int, pool: Sequence[Layout], config: SceneConfig, seed: int
+    config: SceneConfig, index: int, position: int, pool: Sequence[Layout], *, seed: int
 ) -> tuple[Scene, int]:
     """The scene of frame `index`, and how many objects and look-alikes it has.
 
     Args:
+        config: scene options.
         index: of the frame, over all parts.
         position: of the frame in its part; layouts are taken in turn.
         pool: layouts of its part; empty: from the fitted model.
-        config: scene options.
         seed: of the data set.
     """
     rng = np.random.default_rng([seed, 2, index])
@@ -113,15 +113,15 @@ def draw_scene(
         max_objects=config.max_objects,
         max_look_alikes=config.max_look_alikes,
     )
-    return build_scene(rng, layout, config), len(layout)
+    return build_scene(config, layout, rng=rng), len(layout)
 
 
 def simulate_frames(
-    frames: Sequence[tuple[int, int, Sequence[Layout]]],
     scene_config: SceneConfig,
     sensor_config: SensorConfig,
-    seed: int,
+    frames: Sequence[tuple[int, int, Sequence[Layout]]],
     *,
+    seed: int,
     chunk: int = 8,
     batch_size: int | None = None,
 ) -> Iterator[SimulatedFrame]:
@@ -129,17 +129,19 @@ def simulate_frames(
 
     A frame depends on seed and index alone, not on the chunks. `batch_size` is that of `render`.
     """
-    beams = rays(nominal_calibration(sensor_config.scale), sensor_config)
+    beams = rays(sensor_config, nominal_calibration(sensor_config.scale))
     root = jax.random.key(seed)
     for start in range(0, len(frames), chunk):
         part = list(frames[start : start + chunk])
         padded = part + [part[-1]] * (chunk - len(part))  # one program for all chunks
-        drawn = [draw_scene(i, k, pool, scene_config, seed) for i, k, pool in padded]
+        drawn = [draw_scene(scene_config, i, k, pool, seed=seed) for i, k, pool in padded]
         scenes = jax.tree.map(lambda *leaves: np.stack(leaves), *[scene for scene, _ in drawn])
         keys = jax.vmap(lambda i: jax.random.fold_in(root, i))(
             np.array([i for i, _, _ in padded], np.uint32)
         )
-        read = jax.device_get(render(scenes, beams, keys, sensor_config, batch_size=batch_size))
+        read = jax.device_get(
+            render(sensor_config, scenes, beams, keys=keys, batch_size=batch_size)
+        )
         for n, (index, _, _) in enumerate(part):
             scene, n_things = drawn[n]
             readings = Readings(*(leaf[n] for leaf in read))

@@ -8,8 +8,8 @@ import numpy as np
 
 from fusion.detection.kitti.calibration import Calibration
 from fusion.detection.kitti.objects import Objects
+from fusion.detection.simulator.rendering import Readings
 from fusion.detection.simulator.scene import KINDS, LABELLED, Scene
-from fusion.detection.simulator.sensors import Readings
 
 __all__ = ["Visibility", "image_boxes", "labels_of", "visibility_of"]
 

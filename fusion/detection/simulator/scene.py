@@ -206,7 +206,7 @@ def _frustums(kind: str, size: np.ndarray) -> np.ndarray:
     )  # fmt: skip
 
 
-def build_scene(rng: np.random.Generator, layout: Layout, config: SceneConfig) -> Scene:
+def build_scene(config: SceneConfig, layout: Layout, *, rng: np.random.Generator) -> Scene:
     """Give a layout a ground, bodies, paint, surroundings and light.
 
     The objects of the layout take the first slots, in order.

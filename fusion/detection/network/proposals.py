@@ -23,7 +23,7 @@ from fusion.detection.geometry.encodings import (
     project_boxes,
     resolve_heading,
 )
-from fusion.detection.geometry.nms import nms
+from fusion.detection.geometry.suppression import nms
 
 __all__ = ["Detections", "anchor_boxes", "decode_second", "final_boxes", "propose", "view_boxes"]
 
@@ -56,24 +56,24 @@ def anchor_boxes(anchors: Float[Array, "n 6"]) -> Float[Array, "n 7"]:
 
 
 def view_boxes(
+    config: DetectorConfig,
     anchors: Float[Array, "n 6"],
     p2: Float[Array, "3 4"],
     image_size: Float[Array, "2"],
-    config: DetectorConfig,
 ) -> tuple[Float[Array, "n 4"], Float[Array, "n 4"]]:
     """Where anchors lie in the image and in the map, in the units of `crop_and_resize`."""
     corners = box_corners(anchor_boxes(anchors))
     image = project_boxes(corners, p2, image_size[0], image_size[1])
     # A box that leaves the picture is cropped at its border, not filled up with zeros.
-    return jnp.clip(image, 0.0, 1.0), ground_to_unit(anchor_ground(anchors), config.bev)
+    return jnp.clip(image, 0.0, 1.0), ground_to_unit(config.bev, anchor_ground(anchors))
 
 
 def propose(
+    config: DetectorConfig,
     anchors: Float[Array, "n 6"],
     mask: Bool[Array, "n"],
     objectness: Float[Array, "n 2"],
     offsets: Float[Array, "n 6"],
-    config: DetectorConfig,
     n_proposals: int,
 ) -> tuple[Float[Array, "k 6"], Bool[Array, "k"]]:
     """The best regressed anchors that do not overlap more than `config.rpn_nms`."""
@@ -105,11 +105,11 @@ def decode_second(
 
 
 def final_boxes(
+    config: DetectorConfig,
     boxes: Float[Array, "k 7"],
     scores: Float[Array, "k 2"],
     mask: Bool[Array, "k"],
     weights: Float[Array, "2"],
-    config: DetectorConfig,
 ) -> Detections:
     """Probabilities, suppression on the ground, and the boxes above the score threshold."""
     probability = jax.nn.softmax(scores, axis=-1)[:, 1]

@@ -27,7 +27,7 @@ import numpy as np
 from jaxtyping import Array, Key, PRNGKeyArray
 
 from fusion.detection.kitti.calibration import Calibration, camera_to_lidar, lidar_to_camera
-from fusion.detection.kitti.hdl64 import AZIMUTH_STEP, ELEVATIONS, RANGE_NOISE
+from fusion.detection.sensors.hdl64 import AZIMUTH_STEP, ELEVATIONS, RANGE_NOISE
 from fusion.detection.simulator.materials import surfaces
 from fusion.detection.simulator.raycast import cast
 from fusion.detection.simulator.scene import Scene
@@ -147,7 +147,7 @@ def nominal_calibration(scale: float = 1.0) -> Calibration:
     return Calibration(projections, turn(0, 1, 0.5) @ turn(1, 2, 0.2), velo, np.eye(3, 4))
 
 
-def rays(calibration: Calibration, config: SensorConfig) -> Rays:
+def rays(config: SensorConfig, calibration: Calibration) -> Rays:
     """The rays of both sensors; the same for all frames of one calibration."""
     s = config.rays_per_side
     v, u = np.meshgrid(
@@ -175,7 +175,7 @@ def rays(calibration: Calibration, config: SensorConfig) -> Rays:
 
 
 def _camera(
-    scene: Scene, beams: Rays, key: PRNGKeyArray, config: SensorConfig
+    config: SensorConfig, scene: Scene, beams: Rays, key: PRNGKeyArray
 ) -> tuple[Array, ...]:
     origin, directions = jnp.asarray(beams.camera_origin), jnp.asarray(beams.camera)
     hits = cast(scene, origin, directions)
@@ -201,7 +201,7 @@ def _camera(
     return jnp.clip(image, 0.0, 1.0), depth, owner, visible, alone
 
 
-def _lidar(scene: Scene, beams: Rays, key: PRNGKeyArray, config: SensorConfig) -> tuple[Array, ...]:
+def _lidar(config: SensorConfig, scene: Scene, beams: Rays, key: PRNGKeyArray) -> tuple[Array, ...]:
     origin, directions = jnp.asarray(beams.lidar_origin), jnp.asarray(beams.lidar)
     hits = cast(scene, origin, directions)
     surface = surfaces(scene, hits, origin, directions)
@@ -223,20 +223,20 @@ def _lidar(scene: Scene, beams: Rays, key: PRNGKeyArray, config: SensorConfig) -
 
 @partial(jax.jit, static_argnames=("config", "batch_size"))
 def render(
+    config: SensorConfig,
     scenes: Scene,
     beams: Rays,
-    keys: Key[Array, "f"],
-    config: SensorConfig,
     *,
+    keys: Key[Array, "f"],
     batch_size: int | None = None,
 ) -> Readings:
     """Read both sensors in F scenes.
 
     Args:
+        config: sizes (static).
         scenes: `Scene` with a leading axis of F frames.
         beams: from `rays`.
         keys: `[F]` typed PRNG keys; a frame depends on its own key only.
-        config: sizes (static).
         batch_size: frames rendered side by side; None: one after the other, best on a CPU.
 
     Returns:
@@ -246,8 +246,8 @@ def render(
     def one(frame: tuple[Scene, PRNGKeyArray]) -> Readings:
         scene, key = frame
         by_camera, by_lidar = jax.random.split(key)
-        image, depth, owner, visible, alone = _camera(scene, beams, by_camera, config)
-        points, mask, point_owner = _lidar(scene, beams, by_lidar, config)
+        image, depth, owner, visible, alone = _camera(config, scene, beams, by_camera)
+        points, mask, point_owner = _lidar(config, scene, beams, by_lidar)
         return Readings(image, depth, owner, points, mask, point_owner, visible, alone)
 
     return jax.lax.map(one, (scenes, keys), batch_size=batch_size)

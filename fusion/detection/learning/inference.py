@@ -10,49 +10,32 @@ import numpy as np
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import box_corners, project_boxes
-from fusion.detection.geometry.proposals import (
-    Detections,
-    decode_second,
-    final_boxes,
-    propose,
-    view_boxes,
-)
 from fusion.detection.kitti.objects import Objects
-from fusion.detection.learning.examples import Inputs
-from fusion.detection.network.detector import Detector, crop_views, fuse
+from fusion.detection.network.forward import encode, propose_boxes, score_proposals
+from fusion.detection.network.inputs import Inputs
+from fusion.detection.network.proposals import Detections, decode_second, final_boxes
 
 __all__ = ["detect", "to_objects"]
 
 
-def detect(main: Any, stats: Any, config: DetectorConfig, inputs: Inputs) -> Detections:
+def detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Detections:
     """Both stages on a batch of frames, inside jit.
 
     Args:
+        config: static.
         main: `params["main"]`; the auxiliary side and the lattice are not needed.
         stats: of batch norm.
-        config: static.
         inputs: batch of frames.
 
     Returns:
         `Detections` with a leading axis of frames.
     """
-    c = config
-    model: Any = Detector(config)
-    variables = {"params": main, "batch_stats": stats}
-    encoded = model.apply(variables, inputs.image, inputs.bev, False, method="encode")
+    encoded, _ = encode(config, main, stats, inputs, train=False)
     scale = 2.0 * encoded.weights
-    locate = jax.vmap(lambda a, p, s: view_boxes(a, p, s, config))
-    places = locate(inputs.anchors, inputs.p2, inputs.image_size)
-    crops = fuse(crop_views(encoded.maps, places, c.rpn_crop), scale)
-    objectness, offsets = model.apply(variables, crops, False, method="first_stage")
-    proposals, found = jax.vmap(lambda a, m, o, d: propose(a, m, o, d, c, c.proposals))(
-        inputs.anchors, inputs.anchor_mask, objectness, offsets
-    )
-    places = locate(proposals, inputs.p2, inputs.image_size)
-    crops = fuse(crop_views(encoded.features, places, c.second_crop), scale)
-    scores, moves, angle = model.apply(variables, crops, False, method="second_stage")
+    proposals, found = propose_boxes(config, main, encoded, scale, inputs, config.proposals)
+    scores, moves, angle = score_proposals(config, main, encoded, scale, inputs, proposals).outputs
     boxes = jax.vmap(decode_second)(proposals, moves, angle, inputs.plane)
-    return jax.vmap(lambda b, s, m, w: final_boxes(b, s, m, w, c))(
+    return jax.vmap(lambda b, s, m, w: final_boxes(config, b, s, m, w))(
         boxes, scores, found, encoded.weights
     )
 

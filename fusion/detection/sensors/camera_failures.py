@@ -1,0 +1,151 @@
+r"""Failures of the camera, as pure functions of a key on images.
+
+`camera_failure` turns a clean picture into what a failed camera would have read. Severity runs from
+0 (nothing happens, exactly) to 1 (next to nothing is left); it may be traced, the kind is static.
+`random_camera_failure` draws the kind in jit.
+
+===============  ===================================================================================
+camera           severity s
+===============  ===================================================================================
+noise            photon and read noise, variance :math:`s^2 (0.4^2 + 0.1 I)`
+blackout         no picture at any s > 0
+blur             Gaussian point spread of 2 % of the width at s = 1
+fog              :math:`I e^{-\beta d} + A (1 - e^{-\beta d})`, visibility 25 m at s = 1
+exposure         5 stops too bright or too dark at s = 1, saturated
+===============  ===================================================================================
+
+Source: Foi et al. (2008) for noise that depends on the signal; Koschmieder (1924) for fog, with the
+contrast threshold of 5 % that the meteorological range is defined by. Sizes at s = 1 are our
+choice: each makes its sensor nearly useless for detection, which is what the protocol of the source
+calls a failure.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from typing import Literal, get_args
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, PRNGKeyArray
+
+from fusion.detection.sensors.checks import Severity, check_failure
+
+__all__ = ["CAMERA_FAILURES", "CameraFailure", "camera_failure", "random_camera_failure"]
+
+CameraFailure = Literal["noise", "blackout", "blur", "fog", "exposure"]
+CAMERA_FAILURES: tuple[CameraFailure, ...] = get_args(CameraFailure)
+
+READ_NOISE = 0.4  # sd, of a pixel in [0, 1]
+SHOT_NOISE = 0.1  # variance per unit of signal
+BLUR_SHARE = 0.02  # sd of the point spread over the image width
+VISIBILITY = 25.0  # [m], of the densest fog
+CONTRAST = 0.05  # contrast left at the visibility (meteorological optical range)
+AIRLIGHT = 0.8  # brightness of the fog itself
+FOG_DISTANCE = 30.0  # [m], of the whole picture where no depth is given
+STOPS = 5.0  # exposure error [factors of 2]
+GAMMA = 2.2  # pixel value = light ** (1 / GAMMA)
+
+Image = Float[Array, "h w 3"]
+Depth = Float[Array, "h w"]
+
+
+def _noise(key: PRNGKeyArray, image: Array, s: Array, depth: Array | None) -> Array:
+    sd = s * jnp.sqrt(READ_NOISE**2 + SHOT_NOISE * image)
+    return jnp.clip(image + sd * jax.random.normal(key, image.shape, image.dtype), 0.0, 1.0)
+
+
+def _blackout(key: PRNGKeyArray, image: Array, s: Array, depth: Array | None) -> Array:
+    return jnp.zeros_like(image)
+
+
+def _blur(key: PRNGKeyArray, image: Array, s: Array, depth: Array | None) -> Array:
+    largest = BLUR_SHARE * image.shape[1]
+    radius = max(1, math.ceil(2.5 * largest))
+    offset = jnp.arange(-radius, radius + 1, dtype=image.dtype)
+    # A hundredth of a pixel keeps the weights finite; it blurs nothing.
+    kernel = jax.nn.softmax(-0.5 * (offset / jnp.maximum(s * largest, 0.01)) ** 2)
+    padded = jnp.pad(image, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
+    planes = padded.transpose(2, 0, 1)[:, None]
+    for window in (kernel[None, None, :, None], kernel[None, None, None, :]):
+        planes = jax.lax.conv_general_dilated(planes, window, (1, 1), "VALID")
+    return planes[:, 0].transpose(1, 2, 0)
+
+
+def _fog(key: PRNGKeyArray, image: Array, s: Array, depth: Array | None) -> Array:
+    beta = -math.log(CONTRAST) / VISIBILITY * s
+    distance = jnp.full(image.shape[:2], FOG_DISTANCE, image.dtype) if depth is None else depth
+    through = jnp.exp(-beta * jnp.maximum(distance, 0.0))[..., None]
+    return image * through + AIRLIGHT * (1.0 - through)
+
+
+def _exposure(key: PRNGKeyArray, image: Array, s: Array, depth: Array | None) -> Array:
+    stops = jnp.where(jax.random.bernoulli(key), STOPS, -STOPS).astype(image.dtype) * s
+    light = jnp.maximum(image, 0.0) ** GAMMA * 2.0**stops
+    return jnp.minimum(light, 1.0) ** (1.0 / GAMMA)
+
+
+_CAMERA: dict[str, Callable[..., Array]] = {
+    "noise": _noise,
+    "blackout": _blackout,
+    "blur": _blur,
+    "fog": _fog,
+    "exposure": _exposure,
+}
+
+
+def camera_failure(
+    image: Image,
+    kind: str,
+    severity: Severity = 1.0,
+    *,
+    key: PRNGKeyArray,
+    depth: Depth | None = None,
+) -> Image:
+    r"""What a failed camera would have read.
+
+    .. math:: \text{fog: } I' = I e^{-\beta d} + A (1 - e^{-\beta d}), \quad
+        \beta = -\ln 0.05 \, s / 25 \mathrm{m}; \qquad
+        \text{exposure: } I' = \min(2^{\pm 5 s} I^{2.2}, 1)^{1 / 2.2}
+
+    Symbols: :math:`I` is `image`; :math:`s` is `severity`; :math:`d` is `depth` [m], or 30 m
+    everywhere; the airlight :math:`A` is 0.8; the sign of the exposure error is drawn.
+
+    Args:
+        image: `[h, w, 3]` in [0, 1].
+        kind: one of `CAMERA_FAILURES` (static).
+        severity: 0 returns the image itself, 1 is the strongest; may be traced.
+        key: typed PRNG key.
+        depth: `[h, w]` distance of what each pixel shows [m], inf for sky; used by fog alone.
+
+    Raises:
+        ValueError: unknown kind (the message lists the known ones) or severity outside [0, 1].
+
+    Example:
+        >>> import jax, jax.numpy as jnp
+        >>> image = jnp.full((2, 2, 3), 0.5)
+        >>> float(camera_failure(image, "blackout", key=jax.random.key(0)).max())
+        0.0
+    """
+    check_failure("camera", (kind,), CAMERA_FAILURES, severity)
+    s = jnp.asarray(severity, image.dtype)
+    return jnp.where(s > 0.0, _CAMERA[kind](key, image, s, depth), image)
+
+
+def random_camera_failure(
+    image: Image,
+    severity: Severity = 1.0,
+    *,
+    key: PRNGKeyArray,
+    kinds: Sequence[str] = CAMERA_FAILURES,
+    depth: Depth | None = None,
+) -> Image:
+    """`camera_failure` of a kind that is drawn evenly from `kinds`. Raises like it."""
+    check_failure("camera", kinds, CAMERA_FAILURES, severity)
+    choice, rest = jax.random.split(key)
+    branches = [
+        lambda k, x, s, kind=kind: camera_failure(x, kind, s, key=k, depth=depth) for kind in kinds
+    ]
+    index = jax.random.randint(choice, (), 0, len(branches))
+    return jax.lax.switch(index, branches, rest, image, jnp.asarray(severity, image.dtype))

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal, NamedTuple, get_args
 
-from fusion.detection.config import CAR_SIZES, DetectorConfig
+from fusion.detection.config import CAR_SIZES, DETECTORS, DetectorConfig
 from fusion.detection.geometry.anchors import AnchorConfig
 from fusion.detection.geometry.bev import BevConfig
 from fusion.detection.learning.params import DetectorParams
@@ -96,6 +96,8 @@ def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
         >>> setup.train.steps, setup.params.learning_rate
         (2000, 0.002)
     """
+    if model not in DETECTORS:
+        raise ValueError(f"model={model!r}: expected one of {', '.join(DETECTORS)}")
     base = DetectorConfig(model=model)  # type: ignore[arg-type]
     rates = DetectorParams()
     if size == "paper":

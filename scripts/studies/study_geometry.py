@@ -27,7 +27,7 @@ from typing import Any, NamedTuple
 import jax.numpy as jnp
 import numpy as np
 import tyro
-from jaxtyping import Bool, Float
+from jaxtyping import Float
 
 from fusion.detection.geometry.encodings import box_corners
 from fusion.detection.geometry.overlaps import image_iou
@@ -40,7 +40,7 @@ from fusion.detection.kitti.calibration import (
     project,
 )
 from fusion.detection.kitti.files import Frame, frame_names, read_frame
-from fusion.detection.kitti.objects import Objects, select
+from fusion.detection.kitti.objects import Objects, points_inside, select
 from snn_fusion_failure.records.rows import record_table
 from snn_fusion_failure.runs import fail, print_result, progress, repository
 
@@ -93,30 +93,6 @@ class FrameAlignment(NamedTuple):
     standing: np.ndarray
 
 
-def inside_boxes(
-    points: Float[np.ndarray, "n 3"],
-    objects: Objects,
-    *,
-    margin: float = 0.0,
-    clearance: float = 0.0,
-) -> Bool[np.ndarray, "n k"]:
-    """Which camera-frame points lie in which 3D box.
-
-    Args:
-        points: `[n, 3]` [m].
-        objects: k of them, with 3D boxes.
-        margin: the boxes grow by it on their four sides [m].
-        clearance: so much of the box above its bottom face does not count [m].
-    """
-    away = points[:, None] - objects.location[None]
-    cos, sin = np.cos(objects.rotation_y)[None], np.sin(objects.rotation_y)[None]
-    along = away[..., 0] * cos - away[..., 2] * sin
-    across = away[..., 0] * sin + away[..., 2] * cos
-    height, width, length = objects.dimensions.T[:, None]
-    inside = (np.abs(along) < length / 2 + margin) & (np.abs(across) < width / 2 + margin)
-    return inside & (away[..., 1] < -clearance) & (away[..., 1] > -height)
-
-
 def projected_boxes(frame: Frame, objects: Objects) -> Float[np.ndarray, "k 4"]:
     """Left, top, right, bottom [pixel] around the projected corners, cut at the image's border."""
     boxes = np.concatenate(
@@ -132,7 +108,7 @@ def projected_boxes(frame: Frame, objects: Objects) -> Float[np.ndarray, "k 4"]:
 
 def _around(points: np.ndarray, cars: Objects, inside: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
     """Points around each car, and those of them that are among the points inside its box."""
-    near = inside_boxes(points, cars, margin=MARGIN, clearance=CLEARANCE)
+    near = points_inside(points, cars, margin=MARGIN, clearance=CLEARANCE)
     return near.sum(axis=0), (near & inside).sum(axis=0)
 
 
@@ -158,7 +134,7 @@ def align_frame(frame: Frame, *, turn: float = 1.0) -> FrameAlignment:
     back = camera_to_lidar(calibration, camera)
     again = back_project(calibration, pixels[seen], depth[seen])
 
-    inside = inside_boxes(camera[seen], cars)
+    inside = points_inside(camera[seen], cars)
     box = cars.bbox[None]
     at = pixels[seen][:, None]
     in_image_box = ((at >= box[..., :2]) & (at <= box[..., 2:])).all(axis=2)
@@ -168,7 +144,7 @@ def align_frame(frame: Frame, *, turn: float = 1.0) -> FrameAlignment:
         [[np.cos(angle), -np.sin(angle), 0], [np.sin(angle), np.cos(angle), 0], [0, 0, 1.0]]
     )
     scan = lidar_to_camera(calibration, lidar[seen] @ rotation.T)
-    turned, turned_in = _around(scan, cars, inside_boxes(scan, cars))
+    turned, turned_in = _around(scan, cars, points_inside(scan, cars))
     whole = select(cars, cars.truncated == 0)
     plane = fit_plane(camera).plane
     return FrameAlignment(

@@ -51,7 +51,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
         # One frame in memory at a time: the validation list at `paper` is 7 GB.
         for name in names:
             example = read_example(cache.examples(config.split), name)
-            cameras[name] = Camera(example.p2, example.image_size)
+            cameras[name] = Camera(np.asarray(example.p2), np.asarray(example.image_size))
             yield example
 
     failing = f"_{config.failure}" if config.failure else ""

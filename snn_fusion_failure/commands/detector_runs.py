@@ -36,6 +36,12 @@ class Prepare:
     """Accept images of other sizes than the benchmark's (simulated frames)."""
     skip_bad: bool = False
     """Leave out damaged frames, and count them, instead of stopping at the first."""
+    like: Path | None = None
+    """A cache whose anchor sizes are taken, for frames that its detectors are evaluated on."""
+    camera_height: float = 1.65
+    """Of the camera above the road [m], where frames have no plane file."""
+    camera_tilt: float = 8.0
+    """Largest angle of the camera to the road [degree], likewise."""
 
 
 @dataclasses.dataclass(frozen=True)

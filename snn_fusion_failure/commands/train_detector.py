@@ -48,7 +48,8 @@ from snn_fusion_failure.runs.command import run_command
 
 def prepare(config: Prepare) -> dict[str, Any]:
     """Write the cache; returns its counts."""
-    from fusion.detection.learning.cache import TESTING, prepare_cache
+    from fusion.detection.geometry.planes import PlaneConfig
+    from fusion.detection.learning.cache import TESTING, open_cache, prepare_cache
 
     with progress() as bar:
         task = bar.add_task("prepare", total=None, status="")
@@ -58,8 +59,10 @@ def prepare(config: Prepare) -> dict[str, Any]:
             config.size,
             splits=config.splits,
             add=config.add or config.splits[:1] == (TESTING,),
+            like=open_cache(config.like) if config.like else None,
             any_size=config.any_size,
             skip_bad=config.skip_bad,
+            ground=PlaneConfig(camera_height=config.camera_height, max_tilt=config.camera_tilt),
             on_frame=lambda done, n, name: bar.update(task, total=n, completed=done, status=name),
         )
     for name, reason in cache.counts["skipped"].items():
@@ -115,7 +118,9 @@ def train(config: Train) -> dict[str, Any]:
             append_metrics(out, row)
 
         fitted = fit_detector(
-            *setup,
+            setup.config,
+            setup.train,
+            setup.params,
             len(names),
             read,
             seed=config.seed,

@@ -103,20 +103,20 @@ RULES = (
         "--data runs/kitti --min-cars 0 "
         "--found runs/detector/kitti_avod_argate_tiny_failures_s0/eval_val/data",
     ),
-    Rule("train_detector.py prepare", "--preset tiny --any-size"),
-    Rule("train_detector.py train", "--preset tiny --steps 1 --overwrite"),
-    Rule("train_detector.py eval", "--preset tiny --pictures 1"),
+    Rule("train_detector.py prepare", "--size tiny --any-size"),
+    Rule("train_detector.py train", "--size tiny --steps 1 --overwrite"),
+    Rule("train_detector.py eval", "--size tiny --pictures 1"),
     Rule("evaluate_kitti.py"),
     Rule(
         "study_detector.py",
-        "--preset tiny --seeds 1 --steps 1 --kinds camera_blackout --any-size",
+        "--size tiny --seeds 1 --steps 1 --kinds camera_blackout --any-size",
     ),
     Rule(
         "study_views.py",
         "--data runs/kitti --kinds camera_blackout --runs "
         "runs/detector/kitti_avod_argate_tiny_failures_s0",
     ),
-    Rule("bench_detector.py", "--preset tiny --repeats 1 --gemm 64"),
+    Rule("bench_detector.py", "--size tiny --repeats 1 --gemm 64"),
     Rule("bench_kitti_eval.py", "--frames 2 --repeats 1"),
     # Chapter 4.
     Rule("find_failures.py rev_argate_bnn", f"{_SEARCH} --n-total 51"),

@@ -7,12 +7,11 @@ import pytest
 
 from fusion.detection.kitti.calibration import Calibration
 from fusion.detection.kitti.files import Frame
-from fusion.detection.kitti.objects import Objects
+from fusion.detection.kitti.objects import Objects, points_inside
 from tests._scripts import load_script
 
 study = load_script("studies/study_geometry")
-align_frame, inside_boxes = study.align_frame, study.inside_boxes
-projected_boxes = study.projected_boxes
+align_frame, projected_boxes = study.align_frame, study.projected_boxes
 
 P2 = np.array([[700.0, 0, 620, 40], [0, 700.0, 187, 0], [0, 0, 1, 0]])
 VELO = np.array([[0.0, -1, 0, 0.02], [0, 0, -1, -0.06], [1, 0, 0, -0.3]])
@@ -94,8 +93,8 @@ def test_margin_and_clearance() -> None:
     points = PLACE + np.stack(
         [[0, -0.1, 0], [0, 0.1, 0], [0, -1.6, 0], 2.3 * ahead - [0, 1, 0], 2.0 * ahead - [0, 1, 0]]
     )
-    assert inside_boxes(points, box)[:, 0].tolist() == [True, False, False, False, True]
-    grown = inside_boxes(points, box, margin=0.5, clearance=0.3)[:, 0]
+    assert points_inside(points, box)[:, 0].tolist() == [True, False, False, False, True]
+    grown = points_inside(points, box, margin=0.5, clearance=0.3)[:, 0]
     assert grown.tolist() == [False, False, False, True, True]
     with pytest.raises(ValueError, match="frame 000000 has no labels"):
         align_frame(frame(calibration(), None))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 from pathlib import Path
 
@@ -230,7 +231,7 @@ def test_only_anchors_over_points_are_kept(size: int) -> None:
     y = -(plane[0] * x + plane[2] * z + plane[3] - height) / plane[1]
     points, mask = pad_points(np.stack([x, y, z], axis=1), 8)
     grid = anchor_grid(ANCHORS, AREA, PLANE)
-    config = AnchorConfig(sizes=ANCHORS.sizes, stride=1.0, max_anchors=size)
+    config = AnchorConfig(sizes=ANCHORS.sizes, stride=1.0, max_anchors=size, fill=False)
     got = jax.jit(partial(select_anchors, config, AREA))(
         grid, jnp.asarray(points), jnp.asarray(mask), PLANE
     )
@@ -257,9 +258,31 @@ def test_a_dead_lidar_leaves_anchors_everywhere() -> None:
     assert int(got.n_occupied) == 0
     kept = np.asarray(got.boxes)[np.asarray(got.mask)]
     assert len(kept) == 200
-    # Every second place, each with all its sizes and rotations.
+    # Half of the places, each with all its sizes and rotations.
     assert len({tuple(r) for r in kept[:, [0, 2]].tolist()}) == 50
     assert len({tuple(r) for r in kept[:, 3:].tolist()}) == 4
+
+
+def test_spare_slots_stand_evenly_where_the_lidar_is_blind() -> None:
+    """Half of the view is lost; before, no anchor was left there."""
+    plane = np.asarray(PLANE)
+    x, z = (g.ravel() for g in np.meshgrid(np.arange(-4.5, 0, 0.5), np.arange(1, 9, 0.5)))
+    y = -(plane[0] * x + plane[2] * z + plane[3] - 1.0) / plane[1]
+    points, mask = pad_points(np.stack([x, y, z], axis=1), 200)
+    grid = anchor_grid(ANCHORS, AREA, PLANE)
+    config = AnchorConfig(sizes=ANCHORS.sizes, stride=1.0, max_anchors=360)
+    select = jax.jit(partial(select_anchors, config, AREA))
+    got = select(grid, jnp.asarray(points), jnp.asarray(mask), PLANE)
+    bare = dataclasses.replace(config, fill=False)
+    occupied = select_anchors(bare, AREA, grid, jnp.asarray(points), jnp.asarray(mask), PLANE)
+    kept, held = (np.asarray(a.grid_index)[np.asarray(a.mask)].tolist() for a in (got, occupied))
+    assert set(held) <= set(kept) and kept == sorted(set(kept)) and 340 < len(kept) <= 360
+    assert int(got.n_occupied) == int(occupied.n_occupied) == len(held)
+    # Every car in the blind half has a place within a metre and a half.
+    places = np.asarray(got.boxes)[np.asarray(got.mask)][:, [0, 2]]
+    blind = np.stack(np.meshgrid(np.arange(1.5, 4.6, 0.5), np.arange(0.5, 9.6, 0.5)), -1)
+    away = np.linalg.norm(blind.reshape(-1, 1, 2) - places[None], axis=2).min(axis=1)
+    assert away.max() < 1.5
 
 
 @pytest.mark.data

@@ -15,6 +15,8 @@ from fusion.detection.kitti import average_precision as module
 from fusion.detection.kitti.average_precision import (
     average_precision_cap,
     evaluate,
+    hardness_by_distance,
+    hardness_by_points,
     recall_thresholds,
 )
 from fusion.detection.kitti.objects import Objects, concatenate, empty, select
@@ -136,6 +138,58 @@ def test_rules_by_hand() -> None:
             hits([car()], [car(alpha=0.5 + turn)])[1][1], expected, atol=1e-9
         )
     assert np.isnan(hits([car()], [car(alpha=-10.0)])[1][1])
+
+
+def test_a_region_without_3d_box_excuses_detections_without_one() -> None:
+    """The official program compares the -1 x -1 squares at (-1000, -1000), and they coincide."""
+    flat = {"dimensions": [-1.0, -1.0, -1.0], "location": [-1000.0] * 3, "rotation_y": -10.0}
+    away = {"bbox": [500.0, 100.0, 600.0, 200.0]}
+    care = car(type="DontCare", occluded=-1, truncated=-1, bbox=[10.0, 10, 20, 20], **flat)
+    lost = car(**away, **flat)  # a false alarm that is drawn in the image alone
+    np.testing.assert_allclose(hits([car()], [car(), lost])[1], 0.5)
+    np.testing.assert_allclose(hits([car(), care], [car(), lost])[1], [0.5, 0.5, 1.0, 0.5])
+    # A region in another frame excuses nothing.
+    two = evaluate([car(), care], [concatenate([car(), lost]), empty()], classes=("Car",))
+    np.testing.assert_allclose(two.precision[0, 2, 0, 0], 0.5)
+
+
+def test_range_bins_count_objects_and_false_alarms_of_a_bin() -> None:
+    def at(z: float, **changes: object) -> Objects:
+        return car(location=[0.0, 1.7, z], **changes)
+
+    labels, found = [at(10.0), at(25.0), at(60.0)], [at(10.0), at(25.0), at(60.0), at(35.0)]
+    place = {"bbox": [500.0, 100.0, 600.0, 200.0]}
+    found[3] = at(35.0, **place)
+    frames = [concatenate(labels)], [concatenate(found)]
+    counts, first = [], []
+    for bounds in ((0.0, 20.0), (20.0, 40.0), (40.0, float("inf"))):
+        result = evaluate(*frames, classes=("Car",), distance=bounds)
+        counts.append(int(result.n_objects[0, 1]))
+        first.append(float(result.precision[0, 3, 1, 0]))
+    assert counts == [1, 1, 1]
+    np.testing.assert_allclose(first, [1.0, 0.5, 1.0])  # the false alarm lies at 35 m
+    whole = evaluate(*frames, classes=("Car",))
+    assert int(whole.n_objects[0, 1]) == 3
+    with pytest.raises(ValueError, match=r"distance=\(20\.0, 20\.0\): expected the lower"):
+        evaluate(*frames, distance=(20.0, 20.0))
+
+
+def test_data_without_2d_boxes_says_why_and_has_other_difficulties() -> None:
+    none = {"bbox": [0.0, 0.0, 0.0, 0.0]}
+    labels = concatenate([car(location=[0.0, 1.7, z], **none) for z in (10.0, 30.0, 50.0)])
+    with pytest.raises(ValueError, match="none of 3 labels has a 2D box, by whose height"):
+        evaluate([labels], [labels], classes=("Car",))
+    boxed = dataclasses.replace(labels, bbox=labels.bbox + np.array([0, 0, 60, 60]))
+    with pytest.raises(ValueError, match="none of 3 detections has a 2D box"):
+        evaluate([boxed], [labels], classes=("Car",))
+    levels = hardness_by_distance([labels])
+    assert levels[0].tolist() == [0, 1, 2]
+    result = evaluate([labels], [labels], classes=("Car",), hardness=levels)
+    assert result.n_objects.tolist() == [[1, 2, 3]]
+    np.testing.assert_allclose(result.precision[0, 3, :, 0], 1.0)
+    assert hardness_by_points([np.array([150, 20, 5, 4])])[0].tolist() == [0, 1, 2, 3]
+    with pytest.raises(ValueError, match="hardness: expected one number for every label"):
+        evaluate([labels], [labels], hardness=[np.zeros(2)])
 
 
 def test_best_overlap_wins_and_pass_one_takes_the_best_score() -> None:

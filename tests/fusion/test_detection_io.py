@@ -123,14 +123,24 @@ def test_calibration_round_trip_and_errors(tmp_path: Path, calibration: Calibrat
         np.testing.assert_allclose(a, b, rtol=1e-12, atol=1e-15)
     text = path.read_text()
     for old, new, message in (
-        ("R0_rect:", "R_rect:", "R0_rect missing, expected P0, P1"),
+        ("R0_rect:", "R_rect:", "R0_rect missing, expected P2, R0_rect"),
         ("R0_rect: ", "R0_rect: 1.0 ", r"line 5: R0_rect has 10 values, expected 9"),
         ("Tr_velo_to_cam: ", "Tr_velo_to_cam: x", r"line 6: Tr_velo_to_cam is 'x.*a number"),
         ("P3:", "P3", r"line 4: expected 'NAME: values'"),
+        ("P3:", "P2:", "line 4: a second P2: expected each matrix once"),
     ):
         path.write_text(text.replace(old, new))
         with pytest.raises(ValueError, match=message):
             read_calibration(path)
+    # Own sensors: three matrices, spaces before the colon, a byte-order mark.
+    needed = [line for line in text.splitlines() if line.startswith(("P2", "R0", "Tr_velo"))]
+    path.write_text("\ufeff" + "\n".join(needed).replace("P2:", "P2 :"), encoding="utf-8")
+    own = read_calibration(path)
+    np.testing.assert_allclose(own.p2, calibration.p2, rtol=1e-12)
+    assert np.isnan(own.projections[0]).all() and np.isnan(own.imu_to_velo).all()
+    write_calibration(path, own)
+    assert len(path.read_text().splitlines()) == 3
+    np.testing.assert_array_equal(read_calibration(path).velo_to_cam, own.velo_to_cam)
     mirrored = calibration._replace(r0_rect=np.diag([1.0, 1.0, -1.0]))
     with pytest.raises(ValueError, match="R0_rect is not a rotation"):
         check_calibration(mirrored)
@@ -174,6 +184,21 @@ def test_points(tmp_path: Path) -> None:
     path.write_bytes(b"123")
     with pytest.raises(ValueError, match="3 bytes"):
         read_points(path)
+    rng = np.random.default_rng(0)
+    good = rng.uniform([2, -30, -2, 0], [70, 30, 2, 1], (120, 4))
+    scan = good.astype("<f4")
+    for data, message in (
+        (good.astype("<f8"), r"reads as 120 points of 4 columns in float64: write x, y, z, refl"),
+        (scan[:, :3], r"reflectances from -.* reads as 120 points of 3 columns in float32"),
+        (np.c_[scan, np.arange(120, dtype="<f4") % 64], r"reads as 120 points of 5 columns in fl"),
+        (scan * np.array([1e3, 1e3, 1e3, 1], "<f4"), r"\(in millimetres\?\), expected metres"),
+        (scan - np.array([0, 0, 0, 0.5], "<f4"), r"reflectances from -0.* expected 0 to 1"),
+    ):
+        path.write_bytes(np.ascontiguousarray(data).tobytes())
+        with pytest.raises(ValueError, match=message):
+            read_points(path)
+    path.write_bytes((scan * np.array([1, 1, 1, 255], "<f4")).astype("<f4").tobytes())
+    assert len(read_points(path)) == 120
     with pytest.raises(FileNotFoundError, match="lidar scan"):
         read_points(tmp_path / "none.bin")
 
@@ -218,7 +243,8 @@ def test_planes_and_splits(tmp_path: Path) -> None:
     write_split(path, ("000003", "000001"))
     assert read_split(path) == ("000003", "000001")
     for text, message in (
-        ("000003\n3\n", "line 2: '3', expected six digits"),
+        ("000003\n../3\n", "line 2: '../3', expected a frame's name"),
+        ("a b\n", "line 1: 'a b', expected a frame's name"),
         ("000003\n000003\n", "line 2: 000003 was already on line 1"),
         ("\n", "no frame listed"),
     ):
@@ -244,6 +270,14 @@ def test_frame_needs_its_files(tmp_path: Path, calibration: Calibration) -> None
     frame = read_frame(tmp_path, "000004")
     assert frame.labels is not None and len(frame.labels) == 0 and frame.plane is None
     assert frame_names(folder / "calib") == ("000004",)
+    # Own frames: any name, and pictures as a camera writes them.
+    for kind, suffix in (("velodyne", ".bin"), ("calib", ".txt"), ("label_2", ".txt")):
+        (folder / kind / f"000004{suffix}").rename(folder / kind / f"drive_7.a-1{suffix}")
+    Image.fromarray(picture).save(folder / "image_2" / "drive_7.a-1.jpg", quality=95)
+    write_split(tmp_path / "own.txt", ("drive_7.a-1",))
+    assert read_split(tmp_path / "own.txt") == ("drive_7.a-1",)
+    assert frame_names(folder / "image_2", ".png") == ("000004", "drive_7.a-1")
+    assert read_frame(tmp_path, "drive_7.a-1").image.shape == (375, 1242, 3)
 
 
 @pytest.mark.data

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import signal
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -15,6 +16,7 @@ import pytest
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import box3d_to_box4c, box_corners, project_boxes
+from fusion.detection.geometry.planes import PlaneConfig
 from fusion.detection.kitti.calibration import Calibration
 from fusion.detection.kitti.files import Frame
 from fusion.detection.kitti.objects import Objects
@@ -31,7 +33,12 @@ from fusion.detection.learning.examples import (
     make_inputs,
     stack_examples,
 )
-from fusion.detection.learning.fitting import fit_detector, frame_order, run_detector
+from fusion.detection.learning.fitting import (
+    fit_detector,
+    frame_order,
+    restore_detector,
+    run_detector,
+)
 from fusion.detection.learning.gate_objective import gate_terms, path_losses
 from fusion.detection.learning.inference import to_objects
 from fusion.detection.learning.params import DetectorParams
@@ -112,6 +119,15 @@ def test_examples_keep_what_is_in_the_picture(example: Example) -> None:
         make_example(TINY, behind)
     with pytest.raises(ValueError, match=r"frame 000000: .* points near the expected ground"):
         make_example(TINY, frame._replace(plane=None, points=frame.points[:9]))
+    # A camera at 0.7 m: a plane within the limits is found, and hardly a point lies on it.
+    low = frame.points + np.array([0, 0, 0.9, 0], np.float32)
+    with pytest.raises(ValueError, match=r"% of the points near the expected ground lie on one"):
+        make_example(TINY, frame._replace(plane=None, points=low))
+    mount = PlaneConfig(camera_height=0.7, height_tolerance=0.3)
+    made, counts = make_example(TINY, frame._replace(plane=None, points=low), mount)
+    np.testing.assert_allclose(made.plane, [0, -1, 0, 0.7], atol=0.05)
+    with pytest.raises(ValueError, match=r"frame 000000: \d+ % of the points lie more than 0.7 m"):
+        make_example(TINY, frame._replace(plane=np.array([0.0, -1.0, 0.0, 0.1])))
 
 
 def test_mirrored_frames_keep_their_projection(example: Example) -> None:
@@ -352,11 +368,13 @@ def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) ->
 
     def stop(step: int, row: dict[str, float]) -> None:
         if step == 4:
-            raise KeyboardInterrupt
+            signal.raise_signal(signal.SIGINT)  # held back until the step after it is done
 
     with pytest.raises(KeyboardInterrupt):
         fit_detector(TINY, FAILING, RATES, 3, lambda i: example, seed=3, report_every=2,
                      on_report=stop, checkpoint_dir=folder)  # fmt: skip
+    kept = restore_detector(TINY, folder)
+    assert kept is not None and int(kept.step) == 5
     with pytest.raises(ValueError, match="holds checkpoints of another run"):
         fit_detector(TINY, FAILING, RATES, 3, lambda i: example, checkpoint_dir=folder)
     again = fit_detector(
@@ -410,13 +428,18 @@ def test_choices_are_checked_and_rates_fall() -> None:
         (lambda: DetectorConfig(layers=(1,)), "one positive number of layers"),
         (lambda: DetectorConfig(rpn_iou=(0.6, 0.5)), "rpn_iou=.0.6, 0.5."),
         (lambda: DetectorConfig(dropout=1.0), "dropout=1.0"),
-        (lambda: DetectorConfig(normalizer="sparsemax"), "normalizer='sparsemax': expected"),  # type: ignore[arg-type]
-        (lambda: DetectorTrainConfig(schedule="step"), "schedule='step': expected"),  # type: ignore[arg-type]
         (lambda: DetectorParams(learning_rate=-1.0), "learning_rate=-1.0: expected a finite"),
         (lambda: DetectorParams()._replace(clip_norm=0.0), "clip_norm=0.0: expected"),
         (lambda: DetectorParams(l2=float("nan")), "l2=nan: expected"),
     ):
         with pytest.raises(ValueError, match=message):
+            make()
+    # Here beartype is first to refuse them, elsewhere the dataclass is.
+    for make, message in (
+        (lambda: DetectorConfig(normalizer="sparsemax"), "normalizer"),  # type: ignore[arg-type]
+        (lambda: DetectorTrainConfig(schedule="step"), "schedule"),  # type: ignore[arg-type]
+    ):
+        with pytest.raises((ValueError, TypeError), match=message):
             make()
     assert len(SENSOR_FAILURES) == 9
 

@@ -59,3 +59,20 @@ def test_missing_files_are_named(config: evaluate_kitti.Config, tmp_path: Path) 
     (tmp_path / "empty").mkdir()
     with pytest.raises(ValueError, match="holds no detection file"):
         evaluate_kitti.main(dataclasses.replace(config, detections=tmp_path / "empty"))
+
+
+def test_bins_overlap_and_other_difficulties(
+    config: evaluate_kitti.Config, capsys: pytest.CaptureFixture[str]
+) -> None:
+    options = dataclasses.replace(config, classes=("Car",), ranges=(0, 20), overlap=0.5)
+    rows = evaluate_kitti.main(options)["rows"]
+    assert len(rows) == 16 and [r["range"] for r in rows[8::4]] == [[0, 20], [20, None]]
+    text = capsys.readouterr().out
+    assert "AP R40 [%], 0 to 20 m " in text and "AP R40 [%], over 20 m " in text
+    assert rows[11]["moderate"] > 0 and rows[15]["moderate"] == 0  # the far one is never found
+    far = evaluate_kitti.main(dataclasses.replace(options, ranges=(), difficulty="distance"))
+    assert far["objects"]["Car"] == [3, 6, 6]
+    with pytest.raises(FileNotFoundError, match=r"velodyne.000000\.bin does not exist"):
+        evaluate_kitti.main(dataclasses.replace(options, difficulty="points"))
+    with pytest.raises(ValueError, match=r"overlap=1\.5: expected a share"):
+        evaluate_kitti.main(dataclasses.replace(options, overlap=1.5))

@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
+from scipy.ndimage import median_filter, uniform_filter
 
 from fusion.detection.sensors import (
     CAMERA_FAILURES,
@@ -16,9 +19,12 @@ from fusion.detection.sensors import (
     random_camera_failure,
     random_lidar_failure,
 )
+from fusion.detection.sensors.camera_failures import READ_NOISE, _blur
+from fusion.detection.sensors.depth import FARTHEST, depth_image
 from fusion.detection.sensors.hdl64 import ELEVATIONS
 
 KEY = jax.random.key(3)
+DEPTH = jnp.full((24, 64), 15.0)
 camera = jax.jit(camera_failure, static_argnames="kind")
 lidar = jax.jit(lidar_failure, static_argnames="kind")
 
@@ -40,7 +46,8 @@ def scan() -> tuple[jax.Array, jax.Array]:
 
 def test_severity_zero_changes_nothing(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
     for kind in CAMERA_FAILURES:
-        np.testing.assert_array_equal(camera(image, kind, jnp.float32(0), key=KEY), image)
+        same = camera(image, kind, jnp.float32(0), key=KEY, depth=DEPTH)
+        np.testing.assert_array_equal(same, image)
     for kind in LIDAR_FAILURES:
         points, mask = lidar(*scan, kind, jnp.float32(0), key=KEY)
         np.testing.assert_array_equal(points, scan[0])
@@ -49,7 +56,7 @@ def test_severity_zero_changes_nothing(image: jax.Array, scan: tuple[jax.Array, 
 
 def test_more_severity_leaves_less(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
     for kind in CAMERA_FAILURES:
-        out = [camera(image, kind, jnp.float32(s), key=KEY) for s in (0.3, 1.0)]
+        out = [camera(image, kind, jnp.float32(s), key=KEY, depth=DEPTH) for s in (0.3, 1.0)]
         assert all(float(o.min()) >= 0 and float(o.max()) <= 1 for o in out)
         change = [float(jnp.abs(o - image).mean()) for o in out]
         assert change[0] > 0.02 and change[1] >= change[0]
@@ -64,32 +71,36 @@ def test_more_severity_leaves_less(image: jax.Array, scan: tuple[jax.Array, jax.
 
 
 def test_fog_follows_koschmieder(image: jax.Array) -> None:
-    depth = jnp.full(image.shape[:2], 25.0).at[0].set(jnp.inf).at[1].set(0.0)
-    out = camera(image, "fog", jnp.float32(1), depth=depth, key=KEY)
-    np.testing.assert_allclose(out[0], 0.8, atol=1e-6)  # sky: airlight alone
-    np.testing.assert_allclose(out[1], image[1], atol=1e-6)
-    # At the visibility 5 % of the contrast is left.
-    np.testing.assert_allclose(out[2:], 0.05 * image[2:] + 0.95 * 0.8, atol=1e-5)
-    constant = camera(image, "fog", jnp.float32(0.5), key=KEY)
-    through = 0.05 ** (0.5 * 30 / 25)
-    np.testing.assert_allclose(constant, through * image + (1 - through) * 0.8, atol=1e-5)
+    depth = jnp.full(image.shape[:2], 15.0).at[0].set(jnp.inf).at[1].set(0.0)
+    out = np.asarray(camera(image, "fog", jnp.float32(1), depth=depth, key=KEY))
+    # Sky is airlight alone; at the visibility 5 % of the contrast is left; then noise and 8 bits.
+    clean = np.concatenate([np.full_like(image[:1], 0.8), image[1:2], 0.05 * image[2:] + 0.76])
+    np.testing.assert_allclose(out, clean, atol=5 * READ_NOISE)
+    assert (out - clean).std() == pytest.approx(READ_NOISE, rel=0.1)
+    with pytest.raises(ValueError, match="depth=None: expected the distance of each pixel"):
+        camera_failure(image, "fog", key=KEY)
+    with pytest.raises(ValueError, match="depth=None: expected the distance of each pixel"):
+        random_camera_failure(image, key=KEY)
 
 
 def test_exposure_gains_then_saturates(image: jax.Array) -> None:
-    out = [camera(image, "exposure", jnp.float32(0.4), key=jax.random.key(i)) for i in range(8)]
+    out = [camera(image, "exposure", jnp.float32(0.25), key=jax.random.key(i)) for i in range(8)]
     bright = [o for o in out if float(o.mean()) > float(image.mean())]
     dark = [o for o in out if float(o.mean()) < float(image.mean())]
     assert bright and dark
     gain = 2 ** (2 / 2.2)  # two stops
-    np.testing.assert_allclose(bright[0], np.minimum(gain * image, 1.0), rtol=1e-4)
-    np.testing.assert_allclose(dark[0], image / gain, rtol=1e-4)
+    for found, expected in ((bright[0], np.minimum(gain * image, 1.0)), (dark[0], image / gain)):
+        error = np.asarray(found - expected)
+        assert abs(error.mean()) < 0.004 and np.abs(error).mean() < 2 * READ_NOISE
 
 
 def test_blur_is_a_gaussian_mean(image: jax.Array) -> None:
     flat = jnp.full((9, 64, 3), 0.4)
-    np.testing.assert_allclose(camera(flat, "blur", jnp.float32(1), key=KEY), 0.4, rtol=1e-5)
+    blurred = np.asarray(camera(flat, "blur", jnp.float32(1), key=KEY))
+    assert blurred.mean() == pytest.approx(0.4, abs=1e-3)
+    assert blurred.std() == pytest.approx(READ_NOISE, rel=0.1)  # noise is read after the lens
     point = jnp.zeros((25, 64, 3)).at[12, 32].set(1.0)
-    spread = np.asarray(camera(point, "blur", jnp.float32(1), key=KEY))[:, :, 0]
+    spread = np.asarray(_blur(KEY, point, jnp.float32(1), None))[:, :, 0]
     assert spread.sum() == pytest.approx(1.0, abs=1e-4)
     sd = 0.02 * 64
     offset = np.arange(-2, 3)
@@ -102,7 +113,48 @@ def test_camera_noise_has_the_stated_variance() -> None:
     # Little enough that clipping at 0 and 1 does not matter.
     grey = jnp.full((100, 100, 3), 0.5)
     sd = float((camera(grey, "noise", jnp.float32(0.2), key=KEY) - grey).std())
-    assert sd == pytest.approx(0.2 * np.sqrt(0.4**2 + 0.1 * 0.5), rel=0.02)
+    expected = np.sqrt(0.2**2 * (0.4**2 + 0.1 * 0.5) + READ_NOISE**2)
+    assert sd == pytest.approx(expected, rel=0.02)
+
+
+def _detail(image: np.ndarray) -> np.ndarray:
+    """What is finer than a car that is far away: the picture less its mean over 9 x 9 pixels."""
+    return image - uniform_filter(image, (9, 9, 1), mode="nearest")
+
+
+@pytest.mark.parametrize("kind", CAMERA_FAILURES)
+def test_no_correction_restores_a_failed_picture(kind: str) -> None:
+    """Fog of one distance and dark exposure used to be linear maps: one line restored them."""
+    rng = np.random.default_rng(0)
+    blocks = rng.uniform(0.1, 0.9, (12, 40, 3)).repeat(8, axis=0).repeat(8, axis=1)
+    clean = np.clip(blocks + rng.normal(0, 0.03, blocks.shape), 0, 1).astype(np.float32)
+    # The road from 6 m on; above the horizon 60 m.
+    depth = np.where(np.arange(96) < 40, 60.0, 6.0 * 56 / np.maximum(np.arange(96) - 39, 1))
+    depth = jnp.asarray(np.minimum(depth, 60.0)[:, None].repeat(320, axis=1), jnp.float32)
+    for i in range(4):  # exposure errs to both sides
+        failed = camera(
+            jnp.asarray(clean), kind, jnp.float32(1), key=jax.random.key(i), depth=depth
+        )
+        failed = np.asarray(failed)
+        np.testing.assert_allclose(255 * failed, np.round(255 * failed), atol=1e-3)
+        for look in (failed, median_filter(failed, (3, 3, 1))):
+            x, y = _detail(look).ravel(), _detail(clean).ravel()
+            slope = (x @ y) / max(float(x @ x), 1e-12)  # the best brightness and contrast
+            left = ((y - slope * x) ** 2).mean() / (y**2).mean()
+            assert left > 0.4, f"{left:.2f} of the detail's variance is left unexplained"
+
+
+def test_depth_is_the_road_and_nearer_what_the_lidar_met() -> None:
+    p2 = jnp.array([[70.0, 0, 48, 0], [0, 70, 16, 0], [0, 0, 1, 0]])
+    plane, size = jnp.array([0.0, -1.0, 0.0, 1.6]), jnp.array([32.0, 96.0])
+    points = jnp.array([[0.0, 0.0, 9.0], [0.0, 0.0, 30.0], [9.0, 9.0, -5.0], [0.0, 0.0, 0.0]])
+    mask = jnp.array([True, True, True, False])
+    depth = np.asarray(jax.jit(partial(depth_image, (16, 48)))(points, mask, p2, size, plane))
+    assert depth.shape == (16, 48)
+    assert depth[2, 5] == FARTHEST  # above the horizon
+    # Row 12 shows v = 25: 1.6 m below the camera at 70 * 1.6 / 9 m.
+    np.testing.assert_allclose(depth[12, 5], 70 * 1.6 / 9, rtol=1e-4)
+    assert depth[8, 24] == 9.0  # the nearer of two points
 
 
 def test_range_noise_stays_on_the_beam(scan: tuple[jax.Array, jax.Array]) -> None:
@@ -140,12 +192,15 @@ def test_lost_beams_are_rings_and_lost_sectors_are_azimuths(
 def test_drawn_kind_under_vmap(image: jax.Array, scan: tuple[jax.Array, jax.Array]) -> None:
     keys = jax.random.split(KEY, 12)
     pair = ("blackout", "fog")
-    out = jax.jit(jax.vmap(lambda k: random_camera_failure(image, kinds=pair, key=k)))(keys)
+    out = jax.jit(jax.vmap(lambda k: random_camera_failure(image, kinds=pair, key=k, depth=DEPTH)))(
+        keys
+    )
     dark = np.asarray(out).max(axis=(1, 2, 3)) == 0.0
     assert 0 < dark.sum() < 12
-    through = 0.05 ** (30 / 25)
-    fog = through * np.asarray(image) + (1 - through) * 0.8
-    np.testing.assert_allclose(out[~dark], np.broadcast_to(fog, out[~dark].shape), atol=1e-5)
+    fog = 0.05 * np.asarray(image) + 0.95 * 0.8
+    np.testing.assert_allclose(
+        out[~dark], np.broadcast_to(fog, out[~dark].shape), atol=5 * READ_NOISE
+    )
     draw = jax.vmap(
         lambda k: random_lidar_failure(*scan, kinds=("loss", "beam_loss"), key=k)[1].sum()
     )

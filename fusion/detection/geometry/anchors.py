@@ -27,7 +27,7 @@ class AnchorConfig:
         stride: distance of the centres [m].
         occupied_height: range above ground in which points count [m].
         max_anchors: size of the result of the filter.
-        min_occupied: with fewer anchors over points than this the filter is off, see
+        fill: spare rows of the result hold anchors without points, evenly over the area, see
             `select_anchors`.
     """
 
@@ -35,7 +35,7 @@ class AnchorConfig:
     stride: float = 0.5
     occupied_height: tuple[float, float] = (0.2, 2.0)
     max_anchors: int = 32_768
-    min_occupied: int = 1
+    fill: bool = True
 
     def __post_init__(self) -> None:
         """Check sizes and stride."""
@@ -50,7 +50,7 @@ class AnchorConfig:
 
 
 class Anchors(NamedTuple):
-    """Anchors that hold points, at a fixed size.
+    """Anchors that hold points, and others in the rows that are left, at a fixed size.
 
     Attributes:
         boxes: `[k, 6]`; rows without anchor repeat the first anchor of the grid.
@@ -149,6 +149,28 @@ def _occupancy(
     return jnp.pad(total, ((1, 0), (1, 0)))
 
 
+def _spread(bev: BevConfig, config: AnchorConfig) -> np.ndarray:
+    """Order of the places of the grid in which every beginning is spread over the whole area.
+
+    The fractional part of an irrational combination of row and column: a lattice of rank one.
+    """
+    rows = len(np.arange(bev.z_range[0] + config.stride / 2, bev.z_range[1], config.stride))
+    columns = len(np.arange(bev.x_range[0] + config.stride / 2, bev.x_range[1], config.stride))
+    row, column = np.divmod(np.arange(rows * columns), columns)
+    return np.argsort((0.7548776662 * row + 0.5698402910 * column) % 1.0, kind="stable")
+
+
+def _evenly(occupied: Array, bev: BevConfig, config: AnchorConfig, size: int) -> Array:
+    """Anchors without points that fill the rows which the others leave `[n]`."""
+    n_kinds = 2 * len(config.sizes)
+    empty = ~occupied.reshape(-1, n_kinds)  # all sizes and rotations of a place together
+    order = _spread(bev, config)
+    some = empty.any(axis=1)[order]
+    taken = some & (jnp.cumsum(some) <= (size - occupied.sum()) // n_kinds)
+    chosen = jnp.zeros(len(order), bool).at[order].set(taken)
+    return (empty & chosen[:, None]).ravel()
+
+
 def select_anchors(
     config: AnchorConfig,
     bev: BevConfig,
@@ -159,8 +181,12 @@ def select_anchors(
 ) -> Anchors:
     """The anchors of the grid over whose cells there is a point, at a fixed size, inside jit.
 
-    A scan without such anchors (a dead lidar) says nothing about where cars are not: then anchors
-    are taken evenly from the whole grid, so that the camera can still propose.
+    A cell without points says where no car is only as long as the lidar works. The rows that are
+    left over are computed all the same, so they take anchors of places without points, spread
+    evenly over the area with all their sizes and rotations: where a sector or most beams are lost,
+    the camera can still propose.
+
+    Deviation: AVOD leaves these rows empty (`fill=False`).
 
     Args:
         config, bev: static.
@@ -187,9 +213,7 @@ def select_anchors(
     occupied = held > 0
     n_occupied = occupied.sum()
     n, k = grid.shape[0], min(config.max_anchors, grid.shape[0])
-    place = np.arange(n) // (2 * len(config.sizes))  # all sizes and rotations of a place together
-    evenly = jnp.asarray(place % -(-n // k) == 0)
-    chosen = jnp.where(n_occupied >= config.min_occupied, occupied, evenly)
+    chosen = occupied | _evenly(occupied, bev, config, k) if config.fill else occupied
     index = jnp.nonzero(chosen, size=k, fill_value=n)[0]
     found = index < n
     index = jnp.where(found, index, 0)

@@ -8,6 +8,8 @@ from fusion.detection.kitti.average_precision import (
     Evaluation,
     average_precision_cap,
     evaluate,
+    hardness_by_distance,
+    hardness_by_points,
     recall_thresholds,
 )
 from fusion.detection.kitti.calibration import (
@@ -22,6 +24,7 @@ from fusion.detection.kitti.calibration import (
 from fusion.detection.kitti.files import (
     Frame,
     frame_names,
+    image_path,
     read_calibration,
     read_frame,
     read_image,
@@ -45,6 +48,7 @@ from fusion.detection.kitti.objects import (
     Objects,
     concatenate,
     empty,
+    points_inside,
     select,
 )
 
@@ -68,8 +72,12 @@ __all__ = [
     "empty",
     "evaluate",
     "frame_names",
+    "hardness_by_distance",
+    "hardness_by_points",
+    "image_path",
     "in_image",
     "lidar_to_camera",
+    "points_inside",
     "project",
     "read_calibration",
     "read_frame",

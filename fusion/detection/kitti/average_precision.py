@@ -10,9 +10,8 @@ from the right, and averaged over
 Orientation similarity replaces the count of true positives by
 :math:`\sum (1 + \cos\Delta\alpha) / 2`.
 
-The matching is greedy in the order of the label file and cannot be reordered, but frames and
-thresholds are independent. So the k-th object of every frame is matched at once, for all
-thresholds: the number of numpy calls grows with the largest frame, not with the number of frames.
+`evaluate` also measures by distance (`distance`: objects and false alarms of a range bin), and for
+data without 2D boxes by other difficulties than the image's (`hardness`).
 
 Source: Geiger, Lenz, Urtasun (2012); the rules follow the benchmark's evaluation program, 2017
 edition (41 thresholds), and R40 is that of Simonelli et al. (2019). Deviation: average precision is
@@ -21,14 +20,23 @@ NaN, not 0, where no object counts at a difficulty.
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Mapping, Sequence
 from typing import NamedTuple
 
 import numpy as np
 
-from fusion.detection.geometry.overlaps import box3d_iou, ground_iou, image_iou
-from fusion.detection.kitti.objects import DONT_CARE, Objects, concatenate
+from fusion.detection.kitti.matching import (
+    IGNORED,
+    OTHER,
+    VALID,
+    Table,
+    coverage,
+    frame_pairs,
+    match,
+    overlaps,
+    table_of,
+)
+from fusion.detection.kitti.objects import DONT_CARE, Objects, concatenate, select
 
 __all__ = [
     "DIFFICULTIES",
@@ -38,6 +46,8 @@ __all__ = [
     "Evaluation",
     "average_precision_cap",
     "evaluate",
+    "hardness_by_distance",
+    "hardness_by_points",
     "recall_thresholds",
 ]
 
@@ -50,7 +60,6 @@ MIN_HEIGHT = (40.0, 25.0, 25.0)  # [pixel]
 MAX_OCCLUSION = (0, 1, 2)
 MAX_TRUNCATION = (0.15, 0.3, 0.5)
 N_POINTS = 41
-_VALID, _IGNORED, _OTHER = 0, 1, -1
 
 
 class Evaluation(NamedTuple):
@@ -123,124 +132,6 @@ def average_precision_cap(n_objects: int, points: int) -> float:
     return float(100.0 * (reached[::4] if points == 11 else reached[1:]).mean())
 
 
-@dataclasses.dataclass(frozen=True)
-class _Pairs:
-    """All (truth, detection) pairs of the same frame with their overlaps; truths ascending."""
-
-    truth: np.ndarray
-    detection: np.ndarray
-    overlap: dict[str, np.ndarray]
-
-
-@dataclasses.dataclass(frozen=True)
-class _Table:
-    """Candidates `[G, C]` of every truth that has one, in file order, padded with -1."""
-
-    truth: np.ndarray
-    detection: np.ndarray
-    overlap: np.ndarray
-    rounds: list[np.ndarray]  # rows whose turn it is, one frame at most once a round
-
-
-def _frame_pairs(
-    truth_frame: np.ndarray, detection_frame: np.ndarray, n_frames: int
-) -> tuple[np.ndarray, np.ndarray]:
-    """Every truth with every detection of its frame; both frame arrays ascend."""
-    counts = np.bincount(detection_frame, minlength=n_frames)
-    starts = np.cumsum(counts) - counts
-    repeat = counts[truth_frame]
-    truth = np.repeat(np.arange(len(truth_frame)), repeat)
-    within = np.arange(len(truth)) - np.repeat(np.cumsum(repeat) - repeat, repeat)
-    return truth, np.repeat(starts[truth_frame], repeat) + within
-
-
-def _ground(objects: Objects, index: np.ndarray) -> np.ndarray:
-    """`[n, 7]` x, y, z, length, width, height, rotation of the chosen objects."""
-    size = objects.dimensions[index][:, [2, 1, 0]]
-    return np.concatenate([objects.location[index], size, objects.rotation_y[index][:, None]], 1)
-
-
-def _overlaps(labels: Objects, detections: Objects, pairs: tuple[np.ndarray, np.ndarray]) -> _Pairs:
-    truth, detection = pairs
-    overlap = {"2d": image_iou(detections.bbox[detection], labels.bbox[truth])}
-    # Only pairs whose circumscribed circles meet can share ground.
-    reach_t = np.hypot(labels.dimensions[:, 1], labels.dimensions[:, 2]) / 2
-    reach_d = np.hypot(detections.dimensions[:, 1], detections.dimensions[:, 2]) / 2
-    apart = labels.location[truth] - detections.location[detection]
-    near = np.hypot(apart[:, 0], apart[:, 2]) < reach_t[truth] + reach_d[detection]
-    a, b = _ground(detections, detection[near]), _ground(labels, truth[near])
-    for name in ("bev", "3d"):
-        overlap[name] = np.zeros(len(truth))
-    overlap["bev"][near] = ground_iou(a[:, [0, 2, 3, 4, 6]], b[:, [0, 2, 3, 4, 6]])
-    overlap["3d"][near] = box3d_iou(a, b)
-    return _Pairs(truth, detection, overlap)
-
-
-def _table(pairs: _Pairs, keep: np.ndarray, overlap: np.ndarray, frame: np.ndarray) -> _Table:
-    truth, detection, overlap = pairs.truth[keep], pairs.detection[keep], overlap[keep]
-    rows, first, counts = np.unique(truth, return_index=True, return_counts=True)
-    width = int(counts.max()) if len(rows) else 0
-    row = np.repeat(np.arange(len(rows)), counts)
-    column = np.arange(len(truth)) - np.repeat(first, counts)
-    ids = np.full((len(rows), width), -1)
-    values = np.zeros((len(rows), width))
-    ids[row, column], values[row, column] = detection, overlap
-    frames, start = np.unique(frame[rows], return_index=True)
-    turn = np.arange(len(rows)) - start[np.searchsorted(frames, frame[rows])]
-    n_rounds = int(turn.max()) + 1 if len(rows) else 0
-    return _Table(rows, ids, values, [np.flatnonzero(turn == k) for k in range(n_rounds)])
-
-
-class _Counts(NamedTuple):
-    """Over T thresholds: hits, the pairs that hit, and which detections nobody took `[T, D]`."""
-
-    hits: np.ndarray
-    matched_truth: list[np.ndarray]
-    matched_detection: list[np.ndarray]
-    matched_threshold: list[np.ndarray]
-    left: np.ndarray
-
-
-def _match(
-    table: _Table,
-    truth_state: np.ndarray,
-    detection_state: np.ndarray,
-    score: np.ndarray,
-    thresholds: np.ndarray,
-    *,
-    by_score: bool,
-) -> _Counts:
-    """Give every truth its detection, in file order, at every threshold at once."""
-    n_t = len(thresholds)
-    open_ = (score >= thresholds[:, None]) & (detection_state != _OTHER)
-    hits = np.zeros(n_t, np.int64)
-    truths: list[np.ndarray] = []
-    found: list[np.ndarray] = []
-    at: list[np.ndarray] = []
-    for rows in table.rounds:
-        ids = table.detection[rows]
-        able = open_[:, ids] & (ids >= 0)
-        if by_score:
-            rank = np.where(able, score[ids], -np.inf)
-            best, has = rank.argmax(axis=2), able.any(axis=2)
-        else:
-            # Best overlap among detections that count, else the first one that does not.
-            counts = able & (detection_state[ids] == _VALID)
-            best = np.where(counts, table.overlap[rows], -1.0).argmax(axis=2)
-            has = able.any(axis=2)
-            best = np.where(counts.any(axis=2), best, able.argmax(axis=2))
-        threshold, row = np.nonzero(has)
-        detection = ids[row, best[threshold, row]]
-        open_[threshold, detection] = False
-        truth = table.truth[rows[row]]
-        hit = (truth_state[truth] == _VALID) & (detection_state[detection] == _VALID)
-        hits += np.bincount(threshold[hit], minlength=n_t)
-        truths.append(truth[hit])
-        found.append(detection[hit])
-        at.append(threshold[hit])
-    return _Counts(hits, truths, found, at, open_)
-
-
 def _from_right(curve: np.ndarray) -> np.ndarray:
     return np.maximum.accumulate(curve[::-1])[::-1]
 
@@ -248,7 +139,7 @@ def _from_right(curve: np.ndarray) -> np.ndarray:
 def _curves(
     labels: Objects,
     detections: Objects,
-    table: _Table,
+    table: Table,
     truth_state: np.ndarray,
     detection_state: np.ndarray,
     covered: np.ndarray,
@@ -258,14 +149,14 @@ def _curves(
     precision, similarity = np.zeros(N_POINTS), np.zeros(N_POINTS)
     score = detections.score
     lowest = np.array([-np.inf])
-    first = _match(table, truth_state, detection_state, score, lowest, by_score=True)
+    first = match(table, truth_state, detection_state, score, lowest, by_score=True)
     if not n_objects or not first.hits[0]:
         return precision, similarity
     matched = score[np.concatenate(first.matched_detection)]
     thresholds = recall_thresholds(matched, n_objects)
-    counts = _match(table, truth_state, detection_state, score, thresholds, by_score=False)
+    counts = match(table, truth_state, detection_state, score, thresholds, by_score=False)
     # What is still open, counts and lies in no DontCare region is a false positive.
-    false = (counts.left & (detection_state == _VALID) & ~covered).sum(axis=1)
+    false = (counts.left & (detection_state == VALID) & ~covered).sum(axis=1)
     truth, found = np.concatenate(counts.matched_truth), np.concatenate(counts.matched_detection)
     alike = (1.0 + np.cos(labels.alpha[truth] - detections.alpha[found])) / 2.0
     at = np.concatenate(counts.matched_threshold)
@@ -276,21 +167,75 @@ def _curves(
     return _from_right(precision), _from_right(similarity)
 
 
-def _truth_state(labels: Objects, name: str, difficulty: int, min_height: float) -> np.ndarray:
-    height = labels.bbox[:, 3] - labels.bbox[:, 1]
-    hard = (
-        (labels.occluded > MAX_OCCLUSION[difficulty])
-        | (labels.truncated > MAX_TRUNCATION[difficulty])
-        | (height <= min_height)
-    )
-    state = np.where(labels.type == name, np.where(hard, _IGNORED, _VALID), _OTHER)
-    return np.where(labels.type == NEIGHBOUR.get(name, ""), _IGNORED, state)
+def _truth_state(
+    labels: Objects, name: str, difficulty: int, min_height: float, hardness: np.ndarray | None
+) -> np.ndarray:
+    if hardness is None:
+        height = labels.bbox[:, 3] - labels.bbox[:, 1]
+        hard = (
+            (labels.occluded > MAX_OCCLUSION[difficulty])
+            | (labels.truncated > MAX_TRUNCATION[difficulty])
+            | (height <= min_height)
+        )
+    else:
+        hard = hardness > difficulty
+    state = np.where(labels.type == name, np.where(hard, IGNORED, VALID), OTHER)
+    return np.where(labels.type == NEIGHBOUR.get(name, ""), IGNORED, state)
 
 
 def _detection_state(detections: Objects, name: str, min_height: float) -> np.ndarray:
     # Small detections of every class are ignored, but may still take a truth.
     small = np.abs(detections.bbox[:, 1] - detections.bbox[:, 3]) < min_height
-    return np.where(small, _IGNORED, np.where(detections.type == name, _VALID, _OTHER))
+    return np.where(small, IGNORED, np.where(detections.type == name, VALID, OTHER))
+
+
+def _within(objects: Objects, distance: tuple[float, float]) -> np.ndarray:
+    """Which objects lie in a range bin; all of them in the whole range, without 3D box too."""
+    if distance == (0.0, float("inf")):
+        return np.ones(len(objects), bool)
+    away = np.hypot(objects.location[:, 0], objects.location[:, 2])
+    solid = (objects.dimensions > 0).all(axis=1)
+    return solid & (away >= distance[0]) & (away < distance[1])
+
+
+def _require_2d(
+    labels: Sequence[Objects], detections: Sequence[Objects], classes: Sequence[str]
+) -> None:
+    """Refuse data that the image's difficulties would leave without a single object or hit."""
+    for what, frames in (("label", labels), ("detection", detections)):
+        boxes = [f.bbox[np.isin(f.type, classes)] for f in frames]
+        high = np.concatenate([np.zeros(0), *(b[:, 3] - b[:, 1] for b in boxes)])
+        if len(high) and not (high > 0).any():
+            raise ValueError(
+                f"none of {len(high)} {what}s has a 2D box, by whose height easy, moderate and "
+                "hard are told apart: nothing would count; measure by distance or by points in "
+                "the box (`hardness`, --difficulty distance or points)"
+            )
+
+
+def hardness_by_distance(
+    labels: Sequence[Objects], limits: Sequence[float] = (20.0, 40.0, float("inf"))
+) -> list[np.ndarray]:
+    """Difficulty of each label by its distance on the ground, for `evaluate`.
+
+    Args:
+        labels: of every frame.
+        limits: distance up to which an object is easy, moderate, hard [m]; our choice.
+    """
+    away = [np.hypot(f.location[:, 0], f.location[:, 2]) for f in labels]
+    return [np.searchsorted(np.asarray(limits), a, side="right") for a in away]
+
+
+def hardness_by_points(
+    points: Sequence[np.ndarray], limits: Sequence[int] = (100, 20, 5)
+) -> list[np.ndarray]:
+    """Difficulty of each label by the lidar points in its box, for `evaluate`.
+
+    Args:
+        points: of every frame, their number for each label.
+        limits: least number for easy, moderate, hard; our choice.
+    """
+    return [(np.asarray(p)[:, None] < np.asarray(limits)[None]).sum(axis=1) for p in points]
 
 
 def evaluate(
@@ -300,6 +245,8 @@ def evaluate(
     classes: Sequence[str] = ("Car", "Pedestrian", "Cyclist"),
     min_overlap: Mapping[str, float] = MIN_OVERLAP,
     min_height: Sequence[float] = MIN_HEIGHT,
+    distance: tuple[float, float] = (0.0, float("inf")),
+    hardness: Sequence[np.ndarray] | None = None,
 ) -> Evaluation:
     """Precision curves of detections against labels, frame by frame in the same order.
 
@@ -310,13 +257,20 @@ def evaluate(
         min_overlap: overlap above which (strictly) a detection hits, for each class.
         min_height: smallest 2D height at each difficulty [pixel]; for images of another size than
             the benchmark's, multiply by their scale.
+        distance: from and up to which distance on the ground [m] objects count; other objects are
+            ignored, and detections there are no false alarms. The benchmark has no such bound.
+        hardness: of every frame's labels, the difficulty from which on each counts (0 easy, 1
+            moderate, 2 hard, 3 never) in place of the image's rules; for data without 2D boxes,
+            see `hardness_by_distance` and `hardness_by_points`.
 
     Returns:
         `Evaluation`; average precision by `.average_precision(11)` or `(40)`.
 
     Raises:
         ValueError: not the same number of frames, no frame, a detection without a finite score, a
-            class without `min_overlap`, or `min_height` not of three numbers.
+            class without `min_overlap`, `min_height` not of three numbers, an empty `distance`,
+            `hardness` of other sizes than the labels, or (without it) no label or no detection
+            that has a 2D box.
     """
     if len(labels) != len(detections) or not labels:
         raise ValueError(
@@ -330,24 +284,31 @@ def evaluate(
             raise ValueError(
                 f"min_overlap[{name!r}] is {min_overlap.get(name)}, expected a number in (0, 1)"
             )
+    if not 0.0 <= distance[0] < distance[1]:
+        raise ValueError(f"distance={distance}: expected the lower bound [m] first, from 0 on")
     for i, frame in enumerate(detections):
         if not np.isfinite(frame.score).all():
             raise ValueError(f"frame {i}: a detection has no finite score")
+    levels = None
+    if hardness is None:
+        _require_2d(labels, detections, classes)
+    else:
+        if [len(h) for h in hardness] != [len(f) for f in labels]:
+            raise ValueError("hardness: expected one number for every label of every frame")
+        levels = np.concatenate([np.zeros(0), *hardness])
     truth_frame = np.repeat(np.arange(len(labels)), [len(f) for f in labels])
     detection_frame = np.repeat(np.arange(len(labels)), [len(f) for f in detections])
     truths, found = concatenate(labels), concatenate(detections)
 
     relevant = np.isin(truths.type, [*classes, *(NEIGHBOUR.get(c, "") for c in classes)])
     index = np.flatnonzero(relevant)
-    truth, detection = _frame_pairs(truth_frame[index], detection_frame, len(labels))
-    pairs = _overlaps(truths, found, (index[truth], detection))
+    truth, detection = frame_pairs(truth_frame[index], detection_frame, len(labels))
+    pairs = overlaps(truths, found, (index[truth], detection))
 
     regions = np.flatnonzero(truths.type == DONT_CARE)
-    region, other = _frame_pairs(truth_frame[regions], detection_frame, len(labels))
-    cover = np.zeros(len(found))
-    # DontCare has no 3D box, so it excuses detections in the image only.
-    share = image_iou(found.bbox[other], truths.bbox[regions[region]], over="first")
-    np.maximum.at(cover, other, share)
+    region_pairs = frame_pairs(truth_frame[regions], detection_frame, len(labels))
+    cover = coverage(select(truths, regions), found, region_pairs)
+    away = ~_within(found, distance)
 
     with_angle = bool((found.alpha != -10).all())
     precision = np.zeros((len(classes), len(METRICS), len(DIFFICULTIES), N_POINTS))
@@ -356,17 +317,19 @@ def evaluate(
         limit = min_overlap[name]
         wanted = np.isin(truths.type, [name, NEIGHBOUR.get(name, "")])[pairs.truth]
         tables = {
-            metric: _table(pairs, wanted & (overlap > limit), overlap, truth_frame)
+            metric: table_of(pairs, wanted & (overlap > limit), overlap, truth_frame)
             for metric, overlap in pairs.overlap.items()
         }
         for d in range(len(DIFFICULTIES)):
-            truth_state = _truth_state(truths, name, d, min_height[d])
-            detection_state = _detection_state(found, name, min_height[d])
-            n_objects[c, d] = n = int((truth_state == _VALID).sum())
+            truth_state = _truth_state(truths, name, d, min_height[d], levels)
+            truth_state[(truth_state == VALID) & ~_within(truths, distance)] = IGNORED
+            least = min_height[d] if levels is None else 0.0
+            detection_state = _detection_state(found, name, least)
+            n_objects[c, d] = n = int((truth_state == VALID).sum())
             for m, metric in enumerate(METRICS):
                 if metric == "orientation":
                     continue
-                covered = cover > limit if metric == "2d" else np.zeros(len(found), bool)
+                covered = (cover[metric] > limit) | away
                 p, s = _curves(
                     truths, found, tables[metric], truth_state, detection_state, covered, n
                 )

@@ -33,11 +33,12 @@ class Calibration(NamedTuple):
     """Matrices of one calibration file.
 
     Attributes:
-        projections: `[4, 3, 4]`, P0 to P3; P2 is the left colour camera.
+        projections: `[4, 3, 4]`, P0 to P3; P2 is the left colour camera, the others are NaN where
+            there are none.
         r0_rect: `[3, 3]` rectifying rotation of camera 0.
         velo_to_cam: `[3, 4]` lidar to unrectified camera 0.
-        imu_to_velo: `[3, 4]` inertial unit to lidar; not used here, kept so that files can be
-            written back.
+        imu_to_velo: `[3, 4]` inertial unit to lidar, NaN where there is none; not used here, kept
+            so that files can be written back.
     """
 
     projections: np.ndarray
@@ -58,8 +59,11 @@ def check_calibration(calibration: Calibration) -> None:
         ValueError: a matrix is not finite, a rotation is not one (to 1e-3), or P2 cannot be
             inverted.
     """
-    for name, value in calibration._asdict().items():
-        if not np.isfinite(value).all():
+    used = calibration._asdict() | {"projections": calibration.projections[2]}
+    for name, value in used.items():
+        # Matrices that nothing here reads may be missing, whole.
+        missing = name == "imu_to_velo" and np.isnan(value).all()
+        if not (missing or np.isfinite(value).all()):
             raise ValueError(f"{name} holds NaN or inf, expected finite numbers")
     rotations = {
         "R0_rect": calibration.r0_rect,

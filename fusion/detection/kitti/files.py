@@ -3,9 +3,9 @@
     ROOT/training/{image_2,velodyne,calib,label_2,planes}/000000.*
     ROOT/testing/...            ROOT/ImageSets/{train,val,trainval,test}.txt
 
-This file has frames and lists of frames; `io_labels`, `io_geometry` and `io_sensors` have the
-single files, and their functions can be imported from here. Nothing is guessed: a damaged file is
-an error that names file, line and expectation. No file is fetched.
+This file has frames and lists of frames; `label_files`, `geometry_files` and `sensor_files` have
+the single files, and their functions can be imported from here. Nothing is guessed: a damaged file
+is an error that names file, line and expectation. No file is fetched.
 
 Source: Geiger, Lenz, Urtasun (2012), development kit of the KITTI object benchmark; plane files
 and split lists: Chen et al. (2015) and Ku et al. (2018).
@@ -13,7 +13,8 @@ and split lists: Chen et al. (2015) and Ku et al. (2018).
 
 from __future__ import annotations
 
-from collections.abc import Iterable, Sequence
+import re
+from collections.abc import Sequence
 from pathlib import Path
 from typing import NamedTuple
 
@@ -39,6 +40,7 @@ from fusion.detection.kitti.text import read_lines
 __all__ = [
     "Frame",
     "frame_names",
+    "image_path",
     "read_calibration",
     "read_frame",
     "read_image",
@@ -57,12 +59,16 @@ __all__ = [
 ]
 
 
+_NAME = re.compile(r"\w[\w.-]*", re.ASCII)
+_IMAGES = (".png", ".jpg", ".jpeg")
+
+
 def read_split(path: str | Path) -> tuple[str, ...]:
-    """Read an `ImageSets` list: six-digit frame names, each once.
+    """Read an `ImageSets` list: frame names (six digits in the benchmark), each once.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a line is no frame name, a name comes twice, or there is none.
+        ValueError: a line is no file name, a name comes twice, or there is none.
     """
     path = Path(path)
     names: dict[str, int] = {}
@@ -70,8 +76,11 @@ def read_split(path: str | Path) -> tuple[str, ...]:
         name = line.strip()
         if not name:
             continue
-        if len(name) != 6 or not name.isdigit():
-            raise ValueError(f"{path}, line {number}: {name!r}, expected six digits")
+        if not _NAME.fullmatch(name):
+            raise ValueError(
+                f"{path}, line {number}: {name!r}, expected a frame's name such as 000003: "
+                "letters, digits, dots, - and _"
+            )
         if name in names:
             raise ValueError(f"{path}, line {number}: {name} was already on line {names[name]}")
         names[name] = number
@@ -104,7 +113,7 @@ def read_frame(
 
     Args:
         root: the folder that holds `training` and `testing`.
-        name: six digits.
+        name: of its files, without suffix.
         part: `training` or `testing`.
         any_size: accept images of other sizes than the benchmark's.
 
@@ -116,7 +125,7 @@ def read_frame(
     plane = folder / "planes" / f"{name}.txt"
     return Frame(
         name=name,
-        image=read_image(folder / "image_2" / f"{name}.png", any_size=any_size),
+        image=read_image(image_path(folder / "image_2", name), any_size=any_size),
         points=read_points(folder / "velodyne" / f"{name}.bin"),
         calibration=read_calibration(folder / "calib" / f"{name}.txt"),
         labels=read_labels(folder / "label_2" / f"{name}.txt") if part == "training" else None,
@@ -124,10 +133,18 @@ def read_frame(
     )
 
 
+def image_path(folder: Path, name: str) -> Path:
+    """The image of a frame: `.png`, as in the benchmark, or else `.jpg` or `.jpeg`."""
+    there = [path for suffix in _IMAGES if (path := folder / f"{name}{suffix}").is_file()]
+    return there[0] if there else folder / f"{name}.png"
+
+
 def frame_names(folder: str | Path, suffix: str = ".txt") -> tuple[str, ...]:
-    """Names of the frames that have a file in `folder`, sorted."""
+    """Names of the frames that have a file in `folder`, sorted; `.png` finds all images."""
     folder = Path(folder)
     if not folder.is_dir():
         raise FileNotFoundError(f"{folder} does not exist: expected a folder of 000000{suffix} ...")
-    files: Iterable[Path] = folder.glob(f"*{suffix}")
-    return tuple(sorted(p.stem for p in files if len(p.stem) == 6 and p.stem.isdigit()))
+    suffixes = _IMAGES if suffix == ".png" else (suffix,)
+    return tuple(
+        sorted({p.stem for p in folder.iterdir() if p.suffix in suffixes and _NAME.match(p.stem)})
+    )

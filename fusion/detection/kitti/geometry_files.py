@@ -24,14 +24,16 @@ _CALIBRATION_KEYS = {
     "Tr_velo_to_cam": (3, 4),
     "Tr_imu_to_velo": (3, 4),
 }
+_NEEDED = ("P2", "R0_rect", "Tr_velo_to_cam")
 
 
 def read_calibration(path: str | Path) -> Calibration:
-    """Read a `calib` file.
+    """Read a `calib` file; P2, R0_rect and Tr_velo_to_cam are needed, the others may be missing.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: a matrix is missing, has another number of values, or cannot be a calibration.
+        ValueError: a needed matrix is missing, one comes twice, has another number of values, or
+            cannot be a calibration.
     """
     path = Path(path)
     found: dict[str, np.ndarray] = {}
@@ -39,10 +41,13 @@ def read_calibration(path: str | Path) -> Calibration:
         if not line.strip():
             continue
         key, colon, rest = line.partition(":")
+        key = key.strip()
         if not colon:
             raise ValueError(f"{path}, line {number}: expected 'NAME: values', got {line[:40]!r}")
         if key not in _CALIBRATION_KEYS:
             continue
+        if key in found:
+            raise ValueError(f"{path}, line {number}: a second {key}: expected each matrix once")
         shape = _CALIBRATION_KEYS[key]
         values = [parse_number(token, path, number, key) for token in rest.split()]
         if len(values) != shape[0] * shape[1]:
@@ -51,17 +56,18 @@ def read_calibration(path: str | Path) -> Calibration:
                 f"{shape[0] * shape[1]}"
             )
         found[key] = np.array(values).reshape(shape)
-    missing = [key for key in _CALIBRATION_KEYS if key not in found]
+    missing = [key for key in _NEEDED if key not in found]
     if missing:
         raise ValueError(
-            f"{path}: {', '.join(missing)} missing, expected {', '.join(_CALIBRATION_KEYS)} "
+            f"{path}: {', '.join(missing)} missing, expected {', '.join(_NEEDED)} "
             "(a file of another KITTI benchmark?)"
         )
+    none = np.full((3, 4), np.nan)
     calibration = Calibration(
-        np.stack([found[f"P{i}"] for i in range(4)]),
+        np.stack([found.get(f"P{i}", none) for i in range(4)]),
         found["R0_rect"],
         found["Tr_velo_to_cam"],
-        found["Tr_imu_to_velo"],
+        found.get("Tr_imu_to_velo", none),
     )
     try:
         check_calibration(calibration)
@@ -71,7 +77,7 @@ def read_calibration(path: str | Path) -> Calibration:
 
 
 def write_calibration(path: str | Path, calibration: Calibration) -> None:
-    """Write a `calib` file with 13 digits, as the benchmark has them."""
+    """Write a `calib` file with 13 digits, as the benchmark has them; without missing matrices."""
     check_calibration(calibration)
     named = {f"P{i}": p for i, p in enumerate(calibration.projections)}
     named |= {
@@ -79,7 +85,11 @@ def write_calibration(path: str | Path, calibration: Calibration) -> None:
         "Tr_velo_to_cam": calibration.velo_to_cam,
         "Tr_imu_to_velo": calibration.imu_to_velo,
     }
-    lines = [f"{k}: " + " ".join(f"{v:.12e}" for v in m.ravel()) for k, m in named.items()]
+    lines = [
+        f"{k}: " + " ".join(f"{v:.12e}" for v in m.ravel())
+        for k, m in named.items()
+        if not np.isnan(m).all()
+    ]
     Path(path).parent.mkdir(parents=True, exist_ok=True)
     Path(path).write_text("\n".join(lines) + "\n", encoding="ascii")
 

@@ -6,8 +6,18 @@ import dataclasses
 from collections.abc import Sequence
 
 import numpy as np
+from jaxtyping import Bool, Float
 
-__all__ = ["DONT_CARE", "KITTI_TYPES", "NO_BOX3D", "Objects", "concatenate", "empty", "select"]
+__all__ = [
+    "DONT_CARE",
+    "KITTI_TYPES",
+    "NO_BOX3D",
+    "Objects",
+    "concatenate",
+    "empty",
+    "points_inside",
+    "select",
+]
 
 KITTI_TYPES = (
     "Car",
@@ -79,3 +89,27 @@ def concatenate(parts: Sequence[Objects]) -> Objects:
     """All objects of several frames, in order."""
     columns = zip(*(_fields(part) for part in (empty(), *parts)), strict=True)
     return Objects(*(np.concatenate(column) for column in columns))
+
+
+def points_inside(
+    points: Float[np.ndarray, "n 3"],
+    objects: Objects,
+    *,
+    margin: float = 0.0,
+    clearance: float = 0.0,
+) -> Bool[np.ndarray, "n k"]:
+    """Which camera-frame points lie in which 3D box.
+
+    Args:
+        points: `[n, 3]` [m].
+        objects: k of them, with 3D boxes.
+        margin: the boxes grow by it on their four sides [m].
+        clearance: so much of the box above its bottom face does not count [m].
+    """
+    away = points[:, None] - objects.location[None]
+    cos, sin = np.cos(objects.rotation_y)[None], np.sin(objects.rotation_y)[None]
+    along = away[..., 0] * cos - away[..., 2] * sin
+    across = away[..., 0] * sin + away[..., 2] * cos
+    height, width, length = objects.dimensions.T[:, None]
+    inside = (np.abs(along) < length / 2 + margin) & (np.abs(across) < width / 2 + margin)
+    return inside & (away[..., 1] < -clearance) & (away[..., 1] > -height)

@@ -11,9 +11,53 @@ import numpy as np
 
 __all__ = ["read_image", "read_points", "write_image", "write_points"]
 
+_FARTHEST = 500.0  # [m]; lidars reach 300
+_BRIGHTEST = 255.0  # reflectance; 1 in the benchmark
 # Image sizes of the benchmark lie between 1224x370 and 1242x376; resized copies are a common trap,
 # because calibration and labels then no longer fit.
 _IMAGE_HEIGHT, _IMAGE_WIDTH = (370, 376), (1224, 1242)
+
+
+def _implausible(points: np.ndarray) -> str:
+    """Why `[n, >= 4]` numbers are no scan in metres with a reflectance; empty where they can be."""
+    if not len(points):
+        return ""
+    farthest = np.abs(points[:, :3]).max()
+    if farthest > _FARTHEST:
+        near = float(np.median(np.linalg.norm(points[:, :3].astype(np.float64), axis=1)))
+        millimetres = " (in millimetres?)" if 1e3 < near < 2e5 and farthest < 1e6 else ""
+        return (
+            f"the farthest coordinate is {farthest:.3g}, the median distance {near:.3g}"
+            f"{millimetres}, expected metres, below {_FARTHEST:g}"
+        )
+    light = points[:, 3]
+    if light.min() < 0 or light.max() > _BRIGHTEST:
+        return (
+            f"reflectances from {light.min():.3g} to {light.max():.3g}, expected 0 to 1 (or to "
+            f"{_BRIGHTEST:g}) in the fourth column"
+        )
+    return ""
+
+
+def _other_layout(data: bytes) -> str:
+    """What the bytes can be instead of four float32 a point."""
+    for kind, name in (("<f4", "float32"), ("<f8", "float64")):
+        for columns in (4, 5, 3):
+            size = columns * np.dtype(kind).itemsize
+            if (kind, columns) == ("<f4", 4) or not data or len(data) % size:
+                continue
+            table = np.frombuffer(data, kind).reshape(-1, columns)
+            if not np.isfinite(table).all() or np.abs(table[:, :3]).max() < 1e-3:
+                continue
+            if columns == 3 and 2 * table[:, 2].std() > table[:, :2].std(axis=0).max():
+                continue  # heights differ less than places; numbers out of step are all alike
+            whole = table if columns > 3 else np.pad(table, ((0, 0), (0, 1)))
+            if not _implausible(whole):
+                return (
+                    f"; it reads as {len(table)} points of {columns} columns in {name}: write x, "
+                    "y, z, reflectance as float32"
+                )
+    return ""
 
 
 def read_points(path: str | Path, *, drop_invalid: bool = False) -> np.ndarray:
@@ -26,7 +70,8 @@ def read_points(path: str | Path, *, drop_invalid: bool = False) -> np.ndarray:
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file has no point, ends within a point, or holds NaN.
+        ValueError: the file has no point, ends within a point, or holds NaN; or its numbers cannot
+            be metres and reflectances in float32, with what they may be instead.
     """
     path = Path(path)
     if not path.is_file():
@@ -35,9 +80,13 @@ def read_points(path: str | Path, *, drop_invalid: bool = False) -> np.ndarray:
     if len(data) == 0 or len(data) % 16:
         raise ValueError(
             f"{path}: {len(data)} bytes, expected a positive multiple of 16 (four float32 a point)"
+            + _other_layout(data)
         )
     points = np.frombuffer(data, "<f4").reshape(-1, 4)
     good = np.isfinite(points).all(axis=1)
+    wrong = _implausible(points[good])
+    if wrong:
+        raise ValueError(f"{path}: {wrong}{_other_layout(data)}")
     if not good.all():
         if not drop_invalid:
             raise ValueError(

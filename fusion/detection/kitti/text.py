@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import codecs
 from pathlib import Path
 
 import numpy as np
@@ -10,7 +11,7 @@ __all__ = ["parse_number", "read_lines"]
 
 
 def read_lines(path: Path) -> list[str]:
-    """The lines of an ASCII file.
+    """The lines of an ASCII file; a byte-order mark before them, as editors leave it, is skipped.
 
     Raises:
         FileNotFoundError: there is no such file.
@@ -19,7 +20,7 @@ def read_lines(path: Path) -> list[str]:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: expected a KITTI file of this frame")
     try:
-        return path.read_text(encoding="ascii").splitlines()
+        return path.read_bytes().removeprefix(codecs.BOM_UTF8).decode("ascii").splitlines()
     except UnicodeDecodeError as error:
         raise ValueError(
             f"{path}: byte {error.start} is not ASCII: not a KITTI text file"

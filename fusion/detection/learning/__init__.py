@@ -21,6 +21,7 @@ from fusion.detection.learning.detection_loss import (
 from fusion.detection.learning.examples import (
     Example,
     flip,
+    frame_depth,
     make_example,
     make_inputs,
     stack_examples,
@@ -40,6 +41,7 @@ from fusion.detection.learning.gate_objective import (
     path_losses,
 )
 from fusion.detection.learning.inference import detect, to_objects
+from fusion.detection.learning.interrupts import interrupt_between_steps
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.sampling import Assignment, Sample, assign, draw
@@ -89,12 +91,14 @@ __all__ = [
     "fail_sensor",
     "fit_detector",
     "flip",
+    "frame_depth",
     "frame_objects",
     "frame_order",
     "frame_part",
     "gate_terms",
     "image_scale",
     "init_training",
+    "interrupt_between_steps",
     "learning_rate",
     "make_example",
     "make_inputs",

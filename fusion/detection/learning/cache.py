@@ -18,6 +18,7 @@ import numpy as np
 
 from fusion.detection.config import CAR_SIZES, DetectorConfig
 from fusion.detection.geometry.anchors import cluster_sizes
+from fusion.detection.geometry.planes import PlaneConfig
 from fusion.detection.kitti.files import frame_names, read_frame, read_labels, read_split
 from fusion.detection.learning.examples import Example, make_example
 from fusion.detection.presets import preset
@@ -179,6 +180,7 @@ def _read_frames(
     *,
     any_size: bool,
     skip_bad: bool,
+    ground: PlaneConfig | None,
     on_frame: Callable[[int, int, str], None] | None,
 ) -> dict[str, Any]:
     """Write the examples of (part, name); returns counts of what was left out."""
@@ -188,7 +190,7 @@ def _read_frames(
     for done, (part, name) in enumerate(frames):
         try:
             frame = read_frame(root, name, part=part, any_size=any_size)
-            example, left_out = make_example(config, frame)
+            example, left_out = make_example(config, frame, ground)
         except (ValueError, FileNotFoundError) as error:
             if not skip_bad:
                 raise
@@ -213,8 +215,10 @@ def prepare_cache(
     *,
     splits: Sequence[str] = ("train", "val"),
     add: bool = False,
+    like: Cache | None = None,
     any_size: bool = False,
     skip_bad: bool = False,
+    ground: PlaneConfig | None = None,
     on_frame: Callable[[int, int, str], None] | None = None,
 ) -> Cache:
     """Read every frame of the split lists, check it, and write its example.
@@ -225,8 +229,11 @@ def prepare_cache(
         size: of the detector's preset.
         splits: lists to read; the first one gives the anchor sizes.
         add: add the lists to the cache that is there, whose lists and anchor sizes stay.
+        like: take the anchor sizes of this cache, so that its detectors can be evaluated on these
+            frames, such as a corrupted copy of its validation list.
         any_size: accept images of other sizes than the benchmark's.
         skip_bad: leave out frames that cannot be used, and count them, instead of stopping.
+        ground: where ground planes are looked for; the benchmark's car when left out.
         on_frame: called with (done, all, name).
 
     Raises:
@@ -243,7 +250,13 @@ def prepare_cache(
             f"{folder} has size {held.size!r} and the splits {', '.join(held.splits)}: cannot "
             f"add {', '.join(splits)} of size {size!r}; prepare all in another cache folder"
         )
-    if held is None and splits[0] == TESTING:
+    if like is not None and (like.size != size or held is not None):
+        raise ValueError(
+            f"{folder}: the cache to be like has size {like.size!r}, not {size!r}"
+            if held is None
+            else f"{folder}: add to a cache, or make one like another, not both"
+        )
+    if held is None and like is None and splits[0] == TESTING:
         raise ValueError(
             f"{folder}: testing frames have no labels to take anchor sizes from: prepare the "
             "training list first"
@@ -251,7 +264,14 @@ def prepare_cache(
     found, missing = split_frames(root, splits)
     everything = sorted({(frame_part(split), name) for split in found for name in found[split]})
     counts = {"missing": missing} | _read_frames(
-        root, folder, config, everything, any_size=any_size, skip_bad=skip_bad, on_frame=on_frame
+        root,
+        folder,
+        config,
+        everything,
+        any_size=any_size,
+        skip_bad=skip_bad,
+        ground=ground,
+        on_frame=on_frame,
     )
     kept = {
         split: tuple(n for n in names if _skip_key(frame_part(split), n) not in counts["skipped"])
@@ -261,7 +281,9 @@ def prepare_cache(
         if not names:
             first = next(iter(counts["skipped"].values()))
             raise ValueError(f"every frame of the split {split} was skipped; the first: {first}")
-    if held is None:
+    if like is not None:
+        sizes = like.sizes
+    elif held is None:
         sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes))
     else:
         sizes, kept = held.sizes, held.splits | kept

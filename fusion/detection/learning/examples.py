@@ -17,12 +17,13 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.anchors import anchor_grid, select_anchors
 from fusion.detection.geometry.bev import bev_maps
-from fusion.detection.geometry.planes import fit_plane
+from fusion.detection.geometry.planes import PlaneConfig, fit_plane, height_above
 from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
 from fusion.detection.kitti.files import Frame
 from fusion.detection.network.inputs import Inputs
+from fusion.detection.sensors.depth import depth_image
 
-__all__ = ["Example", "flip", "make_example", "make_inputs", "stack_examples"]
+__all__ = ["Example", "flip", "frame_depth", "make_example", "make_inputs", "stack_examples"]
 
 MEAN_RGB = (92.84 / 255, 97.80 / 255, 93.58 / 255)  # of the training images (AVOD)
 
@@ -52,37 +53,63 @@ class Example(NamedTuple):
     truth_mask: np.ndarray | Array
 
 
-def make_example(config: DetectorConfig, frame: Frame) -> tuple[Example, dict[str, int | bool]]:
+_LEAST_ROAD = 0.4  # share of the points near the expected ground that lie on the fitted plane
+_BELOW, _MOST_BELOW = 0.7, 0.3  # [m], share of points that may lie below a given plane
+
+
+def _ground(frame: Frame, camera: np.ndarray, expected: PlaneConfig) -> np.ndarray:
+    """The frame's plane, or the one that is fitted; both are looked at."""
+    if frame.plane is not None:
+        below = (height_above(frame.plane, camera) < -_BELOW).mean()
+        if below > _MOST_BELOW:
+            raise ValueError(
+                f"frame {frame.name}: {100 * below:.0f} % of the points lie more than {_BELOW} m "
+                "below the given ground plane: wrong plane, axes or calibration?"
+            )
+        return frame.plane
+    try:
+        fit = fit_plane(camera, expected)
+    except ValueError as error:
+        raise ValueError(f"frame {frame.name}: {error}") from None
+    if fit.inlier_share < _LEAST_ROAD:
+        raise ValueError(
+            f"frame {frame.name}: {100 * fit.inlier_share:.0f} % of the points near the expected "
+            f"ground lie on one plane, expected at least {100 * _LEAST_ROAD:.0f} %: is the camera "
+            f"{expected.camera_height:g} m above the road and level? Give its height and tilt, or "
+            "plane files"
+        )
+    return fit.plane
+
+
+def make_example(
+    config: DetectorConfig, frame: Frame, ground: PlaneConfig | None = None
+) -> tuple[Example, dict[str, int | bool]]:
     """Arrays of a frame, and what had to be left out of them.
 
     Args:
         config: gives the sizes.
         frame: as read; without a plane file the ground plane is fitted.
+        ground: where the plane is looked for; the benchmark's car when left out.
 
     Returns:
         The example and counts: `plane_fitted`, `points_dropped` (in the image, over `max_points`),
         `labels_dropped` (cars over `max_objects`, farthest first).
 
     Raises:
-        ValueError: no lidar point lies in the image, or no ground plane is found; the message
-            names the frame.
+        ValueError: no lidar point lies in the image, no ground plane is found, too few points lie
+            on it, or too many below a given one; the message names the frame.
     """
     from PIL import Image
 
     height, width = frame.image.shape[:2]
     camera = lidar_to_camera(frame.calibration, frame.points[:, :3])
-    plane = frame.plane
-    if plane is None:
-        try:
-            plane = fit_plane(camera).plane
-        except ValueError as error:
-            raise ValueError(f"frame {frame.name}: {error}") from None
     seen = in_image(*project(frame.calibration, camera), height, width)
     if not seen.any():
         raise ValueError(
             f"frame {frame.name}: none of {len(seen)} lidar points lies in the image: wrong "
             "calibration, or axes other than x forward, y left, z up?"
         )
+    plane = _ground(frame, camera, ground or PlaneConfig())
     x, z = config.bev.x_range, config.bev.z_range
     # A metre more than the area: a failing lidar moves points.
     near = (camera[:, 0] > x[0] - 1) & (camera[:, 0] < x[1] + 1)
@@ -164,6 +191,15 @@ def flip(
         plane * jnp.array([-1.0, 1.0, 1.0, 1.0]),
         boxes,
     )
+
+
+def frame_depth(config: DetectorConfig, example: Example) -> Float[Array, "h w"]:
+    """Distance of what each pixel of the frame's resized image shows [m], inside jit."""
+    to_camera = jnp.asarray(example.to_camera)
+    camera = jnp.asarray(example.points)[:, :3] @ to_camera[:, :3].T + to_camera[:, 3][None]
+    mask, p2 = jnp.asarray(example.point_mask), jnp.asarray(example.p2)
+    size, plane = jnp.asarray(example.image_size), jnp.asarray(example.plane)
+    return depth_image(config.image_size, camera, mask, p2, size, plane)
 
 
 def make_inputs(

@@ -21,6 +21,7 @@ from fusion.detection.config import DetectorConfig
 from fusion.detection.learning.checkpoints import Checkpoints
 from fusion.detection.learning.examples import Example, make_inputs, stack_examples
 from fusion.detection.learning.inference import detect
+from fusion.detection.learning.interrupts import interrupt_between_steps
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.training import (
     DetectorState,
@@ -151,7 +152,7 @@ def fit_detector(
         return stack_examples([read(i) for i in order.tolist()])
 
     done, rows = start, []
-    with ThreadPoolExecutor(1) as reader:
+    with ThreadPoolExecutor(1) as reader, interrupt_between_steps() as check:
         ahead = reader.submit(batch, start) if start < train.steps else None
         try:
             for step in range(start, train.steps):
@@ -163,6 +164,7 @@ def fit_detector(
                 )
                 rows.append((terms, failed))
                 done = step + 1
+                check()
                 if done % report_every and done < train.steps:
                     continue
                 row = {"step": float(done), **_means(rows)}
@@ -178,8 +180,9 @@ def fit_detector(
                 if checkpoints is not None and done % checkpoint_every < report_every:
                     checkpoints.save(done, state, history)
         except KeyboardInterrupt:
-            if checkpoints is not None and not rows:
+            if checkpoints is not None:
                 checkpoints.save(done, state, history)
+                checkpoints.close()
             raise
     if checkpoints is not None:
         checkpoints.save(done, state, history)

@@ -62,7 +62,7 @@ class DetectorParams(_Fields):
         return made
 
     @classmethod
-    def _make(cls, iterable: Iterable[Any]) -> DetectorParams:
+    def _make(cls, iterable: Iterable[Any]) -> DetectorParams:  # type: ignore[override]
         # `_replace` goes this way, and would pass the checks by.
         return cls(*iterable)
 

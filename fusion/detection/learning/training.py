@@ -14,7 +14,7 @@ import optax
 from jaxtyping import Array, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
-from fusion.detection.learning.examples import Example, make_inputs
+from fusion.detection.learning.examples import Example, frame_depth, make_inputs
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.network.detector import init_detector
@@ -123,11 +123,11 @@ def learning_rate(train: DetectorTrainConfig, hyper: DetectorParams, step: Array
 def _l2(hyper: DetectorParams, params: Any) -> Any:
     """Decay of every parameter: kernels only; the lattice holds targets, not weights."""
 
-    def decay(path: Any, _: Array) -> float:
+    def decay(path: Any, _: Array) -> Any:
         names = [str(getattr(entry, "key", entry)) for entry in path]
         if names[-1] != "kernel":
             return 0.0
-        return train.l2_dense if "second" in names else train.l2
+        return hyper.l2_dense if "second" in names else hyper.l2
 
     return jax.tree_util.tree_map_with_path(decay, params)
 
@@ -139,7 +139,7 @@ def _parts(params: Any) -> dict[str, str]:
 
 
 def _optimizer(hyper: DetectorParams) -> optax.GradientTransformation:
-    clip = optax.clip_by_global_norm(hyper.clip_norm)  # type: ignore[arg-type]
+    clip = optax.clip_by_global_norm(hyper.clip_norm)
     parts = {
         "network": optax.chain(clip, optax.scale_by_adam()),
         "targets": optax.chain(optax.scale_by_adam(), optax.scale(hyper.target_rate)),
@@ -179,7 +179,9 @@ def fail_sensor(
     sensor, _, kind = failure.partition("_")
     if sensor == "camera":
         image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
-        return make_inputs(config, example, image=camera_failure(image, kind, severity, key=key))
+        depth = frame_depth(config, example) if kind == "fog" else None
+        failed_image = camera_failure(image, kind, severity, key=key, depth=depth)
+        return make_inputs(config, example, image=failed_image)
     points, mask = jnp.asarray(example.points), jnp.asarray(example.point_mask)
     failed = lidar_failure(points, mask, kind, severity, key=key)
     return make_inputs(config, example, points=failed)
@@ -199,9 +201,16 @@ def training_inputs(
         kinds: dict[str, list[str]] = {"camera": [], "lidar": []}
         for name in train.failure_kinds:
             kinds[name.partition("_")[0]].append(name.partition("_")[2])
+        foggy = "fog" in kinds["camera"]
         image = jax.lax.cond(
             failed[0],
-            lambda: random_camera_failure(image, severity, kinds=kinds["camera"], key=noise),
+            lambda: random_camera_failure(
+                image,
+                severity,
+                kinds=kinds["camera"],
+                key=noise,
+                depth=frame_depth(config, example) if foggy else None,
+            ),
             lambda: image,
         )
         points, mask = jax.lax.cond(

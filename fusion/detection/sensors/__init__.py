@@ -1,22 +1,36 @@
-"""What camera and lidar read, and how each of them fails."""
+"""What camera and lidar read, how each of them fails, and what tells."""
 
 from fusion.detection.sensors.camera_failures import (
     CAMERA_FAILURES,
+    CameraFailure,
     camera_failure,
     random_camera_failure,
 )
-from fusion.detection.sensors.hdl64 import beam_of
+from fusion.detection.sensors.checks import Severity, check_failure
+from fusion.detection.sensors.depth import FARTHEST, depth_image
+from fusion.detection.sensors.hdl64 import AZIMUTH_STEP, ELEVATIONS, N_BEAMS, RANGE_NOISE, beam_of
 from fusion.detection.sensors.lidar_failures import (
     LIDAR_FAILURES,
+    LidarFailure,
     lidar_failure,
     random_lidar_failure,
 )
 
 __all__ = [
+    "AZIMUTH_STEP",
     "CAMERA_FAILURES",
+    "ELEVATIONS",
+    "FARTHEST",
     "LIDAR_FAILURES",
+    "N_BEAMS",
+    "RANGE_NOISE",
+    "CameraFailure",
+    "LidarFailure",
+    "Severity",
     "beam_of",
     "camera_failure",
+    "check_failure",
+    "depth_image",
     "lidar_failure",
     "random_camera_failure",
     "random_lidar_failure",

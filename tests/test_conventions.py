@@ -54,7 +54,6 @@ KNOWN_PLOTS = {
     "jaxsnn.plots.rm_stdp_curves",
     "jaxsnn.plots.spike_raster",
     "jaxsnn.plots.trial_gif",
-    "fusion.detection.simulator.plots.ground_corners",
     "failure.plots.plot_trend",
     "failure.plots.plot_activity",
     "failure.plots.plot_shares",

@@ -49,10 +49,8 @@ SAME_MEANING = {
 """Module names that may occur more than once, and the one thing they mean."""
 KNOWN_CIRCLES: set[tuple[str, str]] = set()
 KNOWN_LONG = {
-    "detector_runs",
     "sweep",
     "train_argate",
-    "train_detector",
     "train_rl",
     "train_snn",
 }

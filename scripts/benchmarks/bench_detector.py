@@ -20,7 +20,7 @@ from typing import Any
 
 import tyro
 
-from snn_fusion_failure.commands.detector_runs import ModelOption, SizeOption
+from snn_fusion_failure.commands.detector_options import ModelOption, SizeOption
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
 

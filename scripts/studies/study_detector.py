@@ -27,11 +27,12 @@ from typing import Any, Literal
 
 import tyro
 
+from snn_fusion_failure.commands import detector_options as choices
 from snn_fusion_failure.commands import detector_runs as runs
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import fail, print_result, repository
 
-MODELS: tuple[runs.Model, ...] = ("avod", "avod_argate")
+MODELS: tuple[choices.Model, ...] = ("avod", "avod_argate")
 METRICS = (
     "3d_easy_r40", "3d_moderate_r40", "3d_hard_r40", "bev_moderate_r40", "2d_moderate_r40",
     "3d_moderate_r11", "3d_moderate_r40_iou50", "bev_moderate_r40_iou50", "weight_auroc",
@@ -58,8 +59,8 @@ class Config:
     """Where the prepared examples go; DATA/cache_PRESET when left out."""
     seeds: int = 3
     first_seed: int = 0
-    models: tuple[runs.Model, ...] = MODELS
-    size: runs.SizeOption = "small"
+    models: tuple[choices.Model, ...] = MODELS
+    size: choices.SizeOption = "small"
     steps: int | None = None
     failures: bool = True
     """Sensors fail in training as well, for both models alike."""
@@ -74,7 +75,7 @@ class Config:
     """Pipeline check: train clean and evaluate on the training list, no failures."""
     any_size: bool = False
     """Accept images of other sizes than the benchmark's (simulated frames)."""
-    changes: runs.Changes = ()
+    changes: choices.Changes = ()
     """Constants of all runs, `detector.path_drop=0` `params.gate.tau=0.2`."""
     learning_rate: float | None = None
     out: Path = Path("runs/study_detector")
@@ -122,7 +123,7 @@ def _prepare(config: Config) -> None:
     from fusion.detection.learning.cache import open_cache
     from snn_fusion_failure.commands import train_detector as command
 
-    prepared = runs.Prepare(config.data, config.size, config.cache, any_size=config.any_size)
+    prepared = choices.Prepare(config.data, config.size, config.cache, any_size=config.any_size)
     folder = runs.cache_folder(prepared)
     if not (folder / "cache.json").exists():
         command.prepare(prepared)
@@ -141,7 +142,7 @@ def execute(config: Config) -> int:
     checked: set[Path] = set()
     for model, seed, failure in evaluations(config):
         record, run = _record(config, model, seed, failure), _run_path(config, model, seed)
-        options = runs.Train(
+        options = choices.Train(
             config.data, model, config.size, config.cache, seed=seed, steps=config.steps,  # type: ignore[arg-type]
             failures=config.failures and not config.real, changes=config.changes,
             learning_rate=config.learning_rate, out=run,
@@ -157,7 +158,7 @@ def execute(config: Config) -> int:
             print(f"train {model} seed {seed}", flush=True)
             command.train(options)
         result = command.evaluate(
-            runs.Eval(
+            choices.Eval(
                 config.data, model, config.size, config.cache, split=split, seed=seed, run=run,  # type: ignore[arg-type]
                 failure=failure, severity=config.severity, overlap=config.overlap,
                 pictures=2 if failure is None else 0, out=record.parent,

@@ -196,12 +196,13 @@ def probe(config: Config, run: Path) -> tuple[str, dict[tuple[str, str], float]]
     from fusion.detection.learning.cache import open_cache
     from fusion.detection.learning.examples import make_inputs
     from fusion.detection.learning.training import SENSOR_FAILURES, fail_sensor
+    from snn_fusion_failure.commands import detector_options as options
     from snn_fusion_failure.commands import detector_runs as runs
 
     unknown = [kind for kind in config.kinds if kind not in SENSOR_FAILURES]
     if unknown:
         raise ValueError(f"kinds={unknown[0]!r}: expected of {', '.join(SENSOR_FAILURES)}")
-    trained = runs.run_config(run, runs.Eval(config.data, cache=config.cache))
+    trained = runs.run_config(run, options.Eval(config.data, cache=config.cache))
     cache = open_cache(runs.cache_folder(trained))
     setup = runs.build(trained, cache)
     detector, state = setup.config, runs.load_run(run, setup)

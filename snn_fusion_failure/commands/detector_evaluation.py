@@ -8,8 +8,8 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.commands.detector_options import Eval
 from snn_fusion_failure.commands.detector_runs import (
-    Eval,
     build,
     cache_folder,
     check_settings,

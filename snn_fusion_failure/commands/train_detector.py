@@ -24,11 +24,9 @@ from typing import Annotated, Any
 import tyro
 
 from snn_fusion_failure.commands.detector_evaluation import evaluate
+from snn_fusion_failure.commands.detector_options import Eval, Prepare, Train
 from snn_fusion_failure.commands.detector_runs import (
     NOT_SETTINGS,
-    Eval,
-    Prepare,
-    Train,
     build,
     cache_folder,
     resolved,

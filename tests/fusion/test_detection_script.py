@@ -64,7 +64,7 @@ def test_missing_files_are_named(config: evaluate_kitti.Config, tmp_path: Path) 
 def test_bins_overlap_and_other_difficulties(
     config: evaluate_kitti.Config, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    options = dataclasses.replace(config, classes=("Car",), ranges=(0, 20), overlap=0.5)
+    options = dataclasses.replace(config, classes=("Car",), ranges=(0.0, 20.0), overlap=0.5)
     rows = evaluate_kitti.main(options)["rows"]
     assert len(rows) == 16 and [r["range"] for r in rows[8::4]] == [[0, 20], [20, None]]
     text = capsys.readouterr().out

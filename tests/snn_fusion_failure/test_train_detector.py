@@ -23,6 +23,7 @@ from fusion.detection.kitti.files import (
 )
 from fusion.detection.kitti.objects import Objects
 from fusion.detection.learning.cache import open_cache, prepare_cache, read_example, split_frames
+from snn_fusion_failure.commands import detector_options as choices
 from snn_fusion_failure.commands import detector_runs as runs
 from snn_fusion_failure.commands import draw_detections
 from snn_fusion_failure.commands import train_detector as command
@@ -75,10 +76,10 @@ def root(tmp_path: Path) -> Path:
 def test_prepare_counts_what_it_leaves_out(root: Path, capsys: pytest.CaptureFixture[str]) -> None:
     calibration = root / "training" / "calib" / "000001.txt"
     calibration.unlink()
-    options = runs.Prepare(root, "tiny", any_size=True)
+    options = choices.Prepare(root, "tiny", any_size=True)
     with pytest.raises(FileNotFoundError, match=r"000001\.txt does not exist"):
         command.main(options)
-    result = command.main(runs.Prepare(root, "tiny", any_size=True, skip_bad=True))
+    result = command.main(choices.Prepare(root, "tiny", any_size=True, skip_bad=True))
     text = capsys.readouterr().out
     assert "skipped 000001" in text and "1 listed frames have no image" in text
     assert text.splitlines()[-1].startswith("result: frames_train=2 frames_val=1 skipped=1")
@@ -109,12 +110,12 @@ def test_lists_are_added_to_a_cache(root: Path) -> None:
     with pytest.raises(ValueError, match="testing frames have no labels to take anchor sizes"):
         prepare_cache(root, folder, "tiny", splits=("testing", "train"))
     with pytest.raises(FileNotFoundError, match="run `prepare` first"):
-        command.main(runs.Prepare(root, "tiny", splits=("testing",)))
+        command.main(choices.Prepare(root, "tiny", splits=("testing",)))
     before = prepare_cache(root, folder, "tiny", splits=("train",), any_size=True)
     with pytest.raises(ValueError, match=r"the splits train, not 'val': run `prepare --add"):
         before.read("val")
-    command.main(runs.Prepare(root, "tiny", splits=("val",), add=True, any_size=True))
-    result = command.main(runs.Prepare(root, "tiny", splits=("testing",), any_size=True))
+    command.main(choices.Prepare(root, "tiny", splits=("val",), add=True, any_size=True))
+    result = command.main(choices.Prepare(root, "tiny", splits=("testing",), any_size=True))
     assert result["frames_testing"] == 2 and result["frames_train"] == 3
     assert result["plane_fitted"] == 2 and result["missing"] == 1
     cache = open_cache(folder)
@@ -128,7 +129,7 @@ def test_lists_are_added_to_a_cache(root: Path) -> None:
     with pytest.raises(ValueError, match="the splits train, val, testing: cannot add val"):
         prepare_cache(root, folder, "tiny", splits=("val",), add=True)
     with pytest.raises(ValueError, match="split 'testing' has no labels to train on"):
-        command.main(runs.Train(root, size="tiny", split="testing"))
+        command.main(choices.Train(root, size="tiny", split="testing"))
     # The benchmark's list of test frames is not a list of labelled ones.
     (lists / "test.txt").write_text("000000\n000003\n")
     with pytest.raises(ValueError, match=r"1 frames of ImageSets/test\.txt are in train\.txt too"):
@@ -159,17 +160,17 @@ def test_bad_frames_are_named(root: Path, damage: str, message: str) -> None:
         path = folder / "label_2" / "000002.txt"
         path.write_text(path.read_text().replace("Car", "Bus"))
     with pytest.raises(ValueError, match=message):
-        command.main(runs.Prepare(root, "tiny", any_size=damage != "size"))
+        command.main(choices.Prepare(root, "tiny", any_size=damage != "size"))
 
 
 def test_missing_steps_are_named(root: Path) -> None:
     with pytest.raises(FileNotFoundError, match="run `prepare` first"):
-        command.main(runs.Train(root, size="tiny"))
+        command.main(choices.Train(root, size="tiny"))
     (root / "ImageSets" / "val.txt").write_text("000900\n")
     with pytest.raises(ValueError, match=r"none of the 1 frames of ImageSets/val\.txt"):
         split_frames(root, ("train", "val"))
     with pytest.raises(ValueError, match="failure='camera_theft'"):
-        command.main(runs.Eval(root, size="tiny", failure="camera_theft"))
+        command.main(choices.Eval(root, size="tiny", failure="camera_theft"))
     with pytest.raises(ValueError, match="kinds='rain': expected of camera_noise"):
         study_detector.evaluations(study_detector.Config(root, kinds=("rain",)))
 
@@ -212,7 +213,7 @@ def test_detections_are_drawn(root: Path, tmp_path: Path) -> None:
 
 def test_runs_of_other_settings_are_not_mixed(root: Path, tmp_path: Path) -> None:
     cache = prepare_cache(root, root / "cache_tiny", "tiny", splits=("train",), any_size=True)
-    options = runs.Train(root, size="tiny", steps=4)
+    options = choices.Train(root, size="tiny", steps=4)
     setup = runs.build(options, cache)
     held = {"settings": runs.resolved(setup)}
     (tmp_path / "result.json").write_text(json.dumps(held))
@@ -286,8 +287,8 @@ def test_study_trains_and_evaluates_both_models(
 
     # Frames without labels: result files and no score.
     move_to_testing(root, "000003")
-    command.main(runs.Prepare(root, "tiny", splits=("testing",), any_size=True))
-    found = command.main(runs.Eval(root, size="tiny", split="testing", run=run, pictures=1))
+    command.main(choices.Prepare(root, "tiny", splits=("testing",), any_size=True))
+    found = command.main(choices.Eval(root, size="tiny", split="testing", run=run, pictures=1))
     assert len(read_results(run / "eval_testing" / "data" / "000003.txt").score) > 0
     assert not any(key.startswith(("3d", "bev", "cars")) for key in found)
     assert (run / "eval_testing" / "000003_image.png").exists()

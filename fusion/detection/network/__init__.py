@@ -20,7 +20,7 @@ from fusion.detection.network.forward import (
 )
 from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
 from fusion.detection.network.heads import MapGate, RpnHead, SecondHead
-from fusion.detection.network.initialize import draw_weights
+from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import (
     Detections,
@@ -51,12 +51,12 @@ __all__ = [
     "crop_and_resize",
     "crop_views",
     "decode_second",
-    "draw_weights",
     "encode",
     "final_boxes",
     "fuse",
     "group_norm_relu",
     "init_detector",
+    "init_weights",
     "propose",
     "propose_boxes",
     "score_anchors",

@@ -17,7 +17,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from fusion.detection.config import DetectorConfig
 from fusion.detection.network.crop import crop_and_resize
 from fusion.detection.network.heads import MapGate, RpnHead, SecondHead
-from fusion.detection.network.initialize import draw_weights
+from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.views import FeaturePyramid
 from fusion.targets import init_targets
 
@@ -168,12 +168,12 @@ def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
         return jax.ShapeDtypeStruct((1, *sides), jnp.float32)
 
     image, bev = shape(*config.image_size, 3), shape(*config.bev.shape, config.bev.n_slices + 1)
-    variables = draw_weights(main_key, Detector(config), image, bev, scales=_OUTPUTS)
+    variables = init_weights(main_key, Detector(config), image, bev, scales=_OUTPUTS)
     params: dict[str, Any] = {"main": variables["params"]}
     if config.model == "avod_argate":
         first = shape(config.rpn_crop, config.rpn_crop, 1)
         second = shape(config.second_crop, config.second_crop, config.widths[0])
-        heads = draw_weights(
+        heads = init_weights(
             aux_key, AuxiliaryHeads(config), (first, first), (second, second), scales=_OUTPUTS
         )
         params["auxiliary"] = heads["params"]

@@ -20,14 +20,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-__all__ = ["draw_weights"]
+__all__ = ["init_weights"]
 
 
 def _name(path: Any) -> tuple[str, ...]:
     return tuple(str(getattr(entry, "key", entry)) for entry in path)
 
 
-def draw_weights(
+def init_weights(
     key: PRNGKeyArray, module: nn.Module, *inputs: Any, scales: Mapping[str, float] | None = None
 ) -> Any:
     """Variables of a module for inputs of these shapes.

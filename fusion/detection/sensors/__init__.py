@@ -6,7 +6,6 @@ from fusion.detection.sensors.camera_failures import (
     camera_failure,
     random_camera_failure,
 )
-from fusion.detection.sensors.checks import Severity, check_failure
 from fusion.detection.sensors.depth import FARTHEST, depth_image
 from fusion.detection.sensors.hdl64 import AZIMUTH_STEP, ELEVATIONS, N_BEAMS, RANGE_NOISE, beam_of
 from fusion.detection.sensors.lidar_failures import (
@@ -15,6 +14,7 @@ from fusion.detection.sensors.lidar_failures import (
     lidar_failure,
     random_lidar_failure,
 )
+from fusion.detection.sensors.severity import Severity, check_failure
 
 __all__ = [
     "AZIMUTH_STEP",

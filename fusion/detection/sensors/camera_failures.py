@@ -35,7 +35,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
-from fusion.detection.sensors.checks import Severity, check_failure
+from fusion.detection.sensors.severity import Severity, check_failure
 
 __all__ = ["CAMERA_FAILURES", "CameraFailure", "camera_failure", "random_camera_failure"]
 

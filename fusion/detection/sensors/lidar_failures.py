@@ -27,8 +27,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from fusion.detection.sensors.checks import Severity, check_failure
 from fusion.detection.sensors.hdl64 import N_BEAMS, beam_of
+from fusion.detection.sensors.severity import Severity, check_failure
 
 __all__ = ["LIDAR_FAILURES", "LidarFailure", "lidar_failure", "random_lidar_failure"]
 

@@ -13,14 +13,14 @@ from fusion.detection.kitti.calibration import lidar_to_camera
 from fusion.detection.kitti.files import Frame
 from fusion.detection.kitti.objects import DONT_CARE, Objects
 
-__all__ = ["ground_corners", "plot_frames"]
+__all__ = ["plot_frames"]
 
 COLOURS = {"Car": "#e69f00", "Van": "#56b4e9", "Truck": "#56b4e9"}
 OTHER = "#cc79a7"
 SIDE, AHEAD = 30.0, 70.0  # [m], of the bird's-eye view
 
 
-def ground_corners(objects: Objects) -> np.ndarray:
+def _ground_corners(objects: Objects) -> np.ndarray:
     """`[n, 4, 2]` x, z of the corners of the footprints [m], the two front ones first."""
     a = 0.5 * objects.dimensions[:, 2, None] * np.array([1, 1, -1, -1])
     c = 0.5 * objects.dimensions[:, 1, None] * np.array([1, -1, -1, 1])
@@ -51,7 +51,7 @@ def _ground(axes: Axes, frame: Frame) -> None:
     )
     if frame.labels is not None:
         solid = frame.labels.type != DONT_CARE
-        corners = ground_corners(frame.labels)
+        corners = _ground_corners(frame.labels)
         for i in np.flatnonzero(solid):
             colour = COLOURS.get(str(frame.labels.type[i]), OTHER)
             axes.add_patch(Polygon(corners[i], fill=False, ec=colour, lw=0.9))

@@ -1,0 +1,95 @@
+"""Options of the detector's commands."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import Annotated, Literal
+
+import tyro
+
+Model = Literal["avod", "avod_argate"]
+Size = Literal["paper", "small", "tiny"]
+ModelOption = Annotated[Model, tyro.conf.arg(aliases=["--config"])]
+SizeOption = Annotated[Size, tyro.conf.arg(aliases=["--preset"])]
+Changes = Annotated[tuple[str, ...], tyro.conf.arg(name="set")]
+
+
+@dataclasses.dataclass(frozen=True)
+class Prepare:
+    """Check the frames of the split lists and write them as examples of fixed size."""
+
+    data: Path
+    """KITTI folder."""
+    size: SizeOption = "small"
+    """Of the network: `paper` (accelerators), `small` (two CPU cores), `tiny` (tests)."""
+    cache: Path | None = None
+    """Where the examples go; DATA/cache_SIZE when left out."""
+    splits: tuple[str, ...] = ("train", "val")
+    """Lists in ImageSets, the first one gives the anchor sizes; `testing`: all of ROOT/testing."""
+    add: bool = False
+    """Add the lists to the cache that is there; always so when `testing` comes first."""
+    any_size: bool = False
+    """Accept images of other sizes than the benchmark's (simulated frames)."""
+    skip_bad: bool = False
+    """Leave out damaged frames, and count them, instead of stopping at the first."""
+    like: Path | None = None
+    """A cache whose anchor sizes are taken, for frames that its detectors are evaluated on."""
+    camera_height: float = 1.65
+    """Of the camera above the road [m], where frames have no plane file."""
+    camera_tilt: float = 8.0
+    """Largest angle of the camera to the road [degree], likewise."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Train:
+    """Train one detector."""
+
+    data: Path
+    model: ModelOption = "avod_argate"
+    size: SizeOption = "small"
+    cache: Path | None = None
+    split: str = "train"
+    seed: int = 0
+    steps: int | None = None
+    batch_size: int | None = None
+    learning_rate: float | None = None
+    failures: bool = False
+    """One sensor fails in two thirds of the training frames."""
+    failure_kinds: tuple[str, ...] = ()
+    """Only these failures, e.g. camera_noise lidar_loss; all when left out."""
+    changes: Changes = ()
+    """Other constants, `detector.path_drop=0` `training.flip=false` `params.gate.tau=0.2`."""
+    checkpoint_every: int = 500
+    out: Path | None = None
+    """Run folder; runs/detector/DATA_MODEL_SIZE[_failures]_sSEED when left out."""
+    resume: bool = False
+    overwrite: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval:
+    """Evaluate a trained detector, all sensors working or one failed."""
+
+    data: Path
+    model: ModelOption = "avod_argate"
+    size: SizeOption = "small"
+    cache: Path | None = None
+    split: str = "val"
+    """List in ImageSets, or `testing`: result files only, since there are no labels."""
+    seed: int = 0
+    failures: bool = False
+    """The run that was trained with failures (names the folder)."""
+    run: Path | None = None
+    """Run folder; named as in `train` when left out."""
+    failure: str | None = None
+    """Sensor failure in every frame, e.g. camera_blackout, lidar_loss."""
+    severity: float = 1.0
+    overlap: float = 0.7
+    """Least overlap of a hit."""
+    loose_overlap: float = 0.5
+    """Of a second score on the ground and in 3D, `3d_moderate_r40_iou50` and so on."""
+    pictures: int = 2
+    """Frames to draw."""
+    out: Path | None = None
+    """Folder of results; RUN/eval_SPLIT[_FAILURE] when left out."""

@@ -1,4 +1,4 @@
-"""Work through chunks: those that are missing, one after another, each into its file at once."""
+"""Work through chunks: those that are missing and nobody works on, one after another."""
 
 from __future__ import annotations
 
@@ -8,114 +8,124 @@ from collections.abc import Callable
 
 import numpy as np
 
-from snn_fusion_failure.sweeps import halving
+from snn_fusion_failure.sweeps import leases
+from snn_fusion_failure.sweeps.chunkfile import DamagedError, set_aside
 from snn_fusion_failure.sweeps.folder import (
-    FAILED,
-    NON_FINITE,
-    OK,
+    Segment,
     Sweep,
+    all_chunks,
+    chunk_name,
     chunk_path,
     done_chunks,
-    load_chunk,
-    save_chunk,
+    read_plan,
+    segments_of,
 )
-from snn_fusion_failure.sweeps.program import Program, compile_study
+from snn_fusion_failure.sweeps.results import Reader
+from snn_fusion_failure.sweeps.rungs import is_complete, next_work
+from snn_fusion_failure.sweeps.worker import Worker
 
-__all__ = ["Rung", "Worker", "check_design", "next_rung", "retry_failed", "run_shard"]
+__all__ = ["Outcome", "Progress", "run_shard"]
 
 
 @dataclasses.dataclass(frozen=True)
-class Rung:
-    """Trials to run on one budget (None: all of it), in chunks of `sweep.chunk_trials`."""
+class Progress:
+    """Where a sweep stands, as it is told after each chunk."""
 
     budget: int | None
-    trials: np.ndarray
-
-    def n_chunks(self, sweep: Sweep) -> int:
-        """Chunks of this rung."""
-        return -(-len(self.trials) // sweep.chunk_trials)
-
-    def chunk(self, sweep: Sweep, number: int) -> np.ndarray:
-        """Trial numbers of a chunk."""
-        return self.trials[number * sweep.chunk_trials : (number + 1) * sweep.chunk_trials]
+    done: int
+    total: int
+    messages: tuple[str, ...] = ()
 
 
-def next_rung(sweep: Sweep) -> Rung:
-    """The first rung that is not complete, or the last one.
+@dataclasses.dataclass(frozen=True)
+class Outcome:
+    """How a worker ended.
 
-    Without successive halving there is one rung with all trials. With it, which settings reach a
-    rung follows from the files of the rung below and from nothing else.
+    Attributes:
+        complete: nothing is left to do.
+        errors: what went wrong, trial by trial or chunk by chunk.
     """
-    settings = np.arange(sweep.design.n)
-    for budget in sweep.budgets:
-        rung = Rung(budget, _trials(sweep, settings))
-        if len(done_chunks(sweep, budget)) < rung.n_chunks(sweep):
-            return rung
-        scores = halving.scores(sweep, budget, rung.trials)
-        settings = halving.survivors(scores, settings, sweep.keep)
-    return Rung(None, _trials(sweep, settings))
+
+    complete: bool
+    errors: tuple[str, ...] = ()
 
 
-def _trials(sweep: Sweep, settings: np.ndarray) -> np.ndarray:
-    return (settings[:, None] * sweep.seeds + np.arange(sweep.seeds)[None]).ravel()
+class _Queue:
+    """Chunks to run, without asking the folder more often than it has to be."""
 
+    def __init__(
+        self, sweep: Sweep, worker: Worker, shard: int, shards: int, exclusive: bool
+    ) -> None:
+        self.sweep, self.worker, self.reader = sweep, worker, Reader(sweep.out)
+        self.shard, self.shards, self.exclusive = shard, shards, exclusive
+        self.waiting: list[tuple[Segment, int]] = []
+        self.given_up: dict[str, str] = {}
+        self._pause = 0.05
 
-def check_design(sweep: Sweep) -> None:
-    """Let the study look at every setting before anything is compiled.
+    def refill(self) -> bool:
+        """Look into the folder; False when nothing is left (that this worker may do)."""
+        while True:
+            planned = all_chunks(self.sweep)
+            done = done_chunks(self.sweep.out)
+            left = [
+                (i, s, c) for i, (s, c) in enumerate(planned)
+                if (s.number, c) not in done and chunk_name(s.number, c) not in self.given_up
+            ]  # fmt: skip
+            if self.exclusive:
+                left = [x for x in left if x[0] % self.shards == self.shard]
+            if left:
+                break
+            if len(done & {(s.number, c) for s, c in planned}) < len(planned):
+                return False  # others', or given up
+            try:
+                if not next_work(self.sweep, self.reader):
+                    return False
+            except DamagedError as error:
+                set_aside(error.path)
+        start = self.shard * len(left) // self.shards if not self.exclusive else 0
+        rotated = left[start:] + left[:start]
+        # What is compiled already comes first: every program is compiled in as few workers as can.
+        rotated.sort(key=lambda x: not self.worker.has(x[1]))
+        self.waiting = [(s, c) for _, s, c in rotated]
+        return True
 
-    Raises:
-        ValueError: from the study, for a setting that cannot run.
-    """
-    from snn_fusion_failure.sweeps.leaves import batch
-
-    study = sweep.study
-    first = np.arange(sweep.design.n) * sweep.seeds
-    units = {leaf: study.unit_of(leaf) for leaf in study.leaves}
-    study.check(batch(study.params, sweep.columns(first), sweep.design.n, units, "float64"))
-
-
-class Worker:
-    """Runs chunks of a sweep; compiles when the first one comes, once per budget."""
-
-    def __init__(self, sweep: Sweep) -> None:
-        self.sweep = sweep
-        self._programs: dict[int | None, Program] = {}
-
-    def _program(self, budget: int | None) -> Program:
-        if budget not in self._programs:
-            study = self.sweep.study
-            if budget is not None:
-                assert study.with_budget is not None
-                study = study.with_budget(budget)
-            self._programs[budget] = compile_study(
-                study, root=self.sweep.root, width=self.sweep.width
-            )
-        return self._programs[budget]
-
-    def run(self, rung: Rung, number: int, *, write: bool = True) -> str:
-        """Run one chunk and write its file; returns what went wrong, empty when nothing did.
-
-        An exception of the trials becomes a file that says so, and the sweep can go on.
-        """
-        sweep = self.sweep
-        trials = rung.chunk(sweep, number)
-        names = list(sweep.study.metrics)
-        start = time.perf_counter()
-        message = ""
-        try:
-            metrics = self._program(rung.budget)(sweep.columns(trials), trials)
-            required = [n for n, m in sweep.study.metrics.items() if not m.optional]
-            finite = np.all([np.isfinite(metrics[n]) for n in required], axis=0)
-            status = np.where(finite, OK, NON_FINITE).astype(np.int8)
-        except Exception as error:
-            message = f"{type(error).__name__}: {error}"
-            metrics = {name: np.full(len(trials), np.nan) for name in names}
-            status = np.full(len(trials), FAILED, np.int8)
-        if write:
-            path = chunk_path(sweep, number, rung.budget)
-            seconds = time.perf_counter() - start
-            save_chunk(path, trials, metrics, status, seconds=seconds, message=message)
-        return message
+    def take(self) -> tuple[Segment, int, leases.Lease] | None:
+        """The next chunk with its lease, None when nothing is left."""
+        while True:
+            busy = False
+            while self.waiting:
+                segment, number = self.waiting.pop(0)
+                name = chunk_name(segment.number, number)
+                path = chunk_path(self.sweep.out, segment.number, number)
+                if path.exists():
+                    continue
+                lease = leases.take(self.sweep.out, name, self.sweep.lease)
+                if lease is None:
+                    busy = True
+                    continue
+                if path.exists():  # its holder ended between the two looks
+                    lease.release()
+                    continue
+                if leases.deaths(self.sweep.out, name) >= leases.DEATHS:
+                    lease.release()
+                    self.given_up[name] = (
+                        f"chunk {name} given up: {leases.DEATHS} workers died in it; "
+                        "--retry-failed tries again"
+                    )
+                    continue
+                self._pause = 0.05
+                return segment, number, lease
+            if busy:
+                try:
+                    more = next_work(self.sweep, self.reader, idle=True)
+                except DamagedError as error:
+                    set_aside(error.path)
+                    more = True
+                if not more:
+                    time.sleep(self._pause)
+                    self._pause = min(1.0, 1.5 * self._pause)
+            if not self.refill():
+                return None
 
 
 def run_shard(
@@ -123,78 +133,76 @@ def run_shard(
     *,
     shard: int = 0,
     shards: int = 1,
-    on_chunk: Callable[[Rung, int, int, str], None] | None = None,
-    on_start: Callable[[int], None] | None = None,
-) -> bool:
-    """Run the chunks `c` with `c % shards == shard` that are not there yet.
+    exclusive: bool = False,
+    on_chunk: Callable[[Progress], None] | None = None,
+    on_start: Callable[[str], None] | None = None,
+) -> Outcome:
+    """Run the chunks that are not there yet and that nobody else works on.
 
     Args:
-        sweep: from its folder.
-        shard, shards: which part of the chunks this process takes.
-        on_chunk: called with the rung, the number of chunks that are there, of all chunks, and
-            what went wrong.
-        on_start: called with the number of a chunk before it is run.
+        sweep: from its folder, with its study.
+        shard, shards: where this worker begins to look.
+        exclusive: run the chunks `c` with `c % shards == shard` and no others.
+        on_chunk: called after each chunk.
+        on_start: called with the name of a chunk before it is run.
 
     Returns:
-        True when the sweep is complete; False when other shards have chunks left to do (with
-        successive halving, run the shard again when they have done them).
+        Outcome. Without `exclusive` a worker waits for chunks of others, and takes them over when
+        their holders die.
     """
     worker = Worker(sweep)
+    queue = _Queue(sweep, worker, shard, shards, exclusive)
+    errors: list[str] = []
+    segments: dict[int, Segment] = {}
+    told = 0.0
     while True:
-        rung = next_rung(sweep)
-        total = rung.n_chunks(sweep)
-        mine = [c for c in range(total) if c % shards == shard]
-        done = _agreed(done_chunks(sweep, rung.budget), total)
-        todo = [c for c in mine if c not in done]
-        for number in todo:
-            if on_start is not None:
-                on_start(number)
-            message = worker.run(rung, number, write=_writes())
-            done = done | {number}
-            if on_chunk is not None:
-                on_chunk(rung, len(done), total, message)
-        _barrier()
-        if len(_agreed(done_chunks(sweep, rung.budget), total)) < total:
-            return False
-        if rung.budget is None:
-            return True
+        taken = queue.take() if _leads() else None
+        place = _agreed((taken[0].number, taken[1]) if taken else (-1, -1))
+        if place[0] < 0:
+            break
+        if place[0] not in segments:
+            segments = {s.number: s for s in segments_of(read_plan(sweep.out))}
+        segment, number = segments[place[0]], place[1]
+        name = chunk_name(segment.number, number)
+        if on_start is not None:
+            on_start(name)
+        try:
+            messages = worker.run(segment, number, write=_leads())
+        except DamagedError as error:
+            set_aside(error.path)
+            messages = []
+        finally:
+            if taken is not None:
+                taken[2].release()
+        errors += messages
+        # Counting looks through the whole folder: not for each of many small chunks.
+        if on_chunk is not None and _leads() and (messages or time.monotonic() - told > 0.2):
+            told = time.monotonic()
+            planned = all_chunks(sweep)
+            same = {(s.number, c) for s, c in planned if s.budget == segment.budget}
+            on_chunk(
+                Progress(segment.budget, len(same & done_chunks(sweep.out)), len(same),
+                         tuple(messages))
+            )  # fmt: skip
+    errors += queue.given_up.values()
+    return Outcome(_agreed((int(_leads() and is_complete(sweep, queue.reader)), 0))[0] == 1,
+                   tuple(errors))  # fmt: skip
 
 
-def retry_failed(sweep: Sweep) -> int:
-    """Delete the files of chunks that failed, so that they are run again; returns their number."""
-    count = 0
-    for budget in (*sweep.budgets, None):
-        for number in sorted(done_chunks(sweep, budget)):
-            path = chunk_path(sweep, number, budget)
-            if (load_chunk(path, ())["status"] == FAILED).any():
-                path.unlink(missing_ok=True)
-                count += 1
-    return count
-
-
-def _writes() -> bool:
+def _leads() -> bool:
+    """Whether this process decides and writes: the only one, or the first of a distributed run."""
     import jax
 
     return jax.process_index() == 0
 
 
-def _agreed(done: set[int], total: int) -> set[int]:
-    """The same set in every process of a distributed run: that of the process that writes."""
+def _agreed(pair: tuple[int, int]) -> tuple[int, int]:
+    """The same pair in every process of a distributed run: that of the process that decides."""
     import jax
 
     if jax.process_count() == 1:
-        return done
+        return pair
     from jax.experimental import multihost_utils
 
-    flags = np.asarray([c in done for c in range(total)], np.int32)
-    flags = np.asarray(multihost_utils.broadcast_one_to_all(flags))
-    return {int(c) for c in np.flatnonzero(flags)}
-
-
-def _barrier() -> None:
-    import jax
-
-    if jax.process_count() > 1:
-        from jax.experimental import multihost_utils
-
-        multihost_utils.sync_global_devices("sweep")
+    found = multihost_utils.broadcast_one_to_all(np.asarray(pair, np.int32))
+    return int(found[0]), int(found[1])

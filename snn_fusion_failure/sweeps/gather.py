@@ -3,115 +3,166 @@
 from __future__ import annotations
 
 import json
-import os
-import tempfile
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 
-from snn_fusion_failure.sweeps.chunks import next_rung
+from snn_fusion_failure.runs.files import write_bytes
+from snn_fusion_failure.sweeps.chunkfile import DamagedError
+from snn_fusion_failure.sweeps.designs import digest
 from snn_fusion_failure.sweeps.folder import (
     MISSING,
     STATUS,
     Sweep,
+    all_chunks,
     chunk_path,
     done_chunks,
-    load_chunk,
+    read_plan,
+    segments_of,
 )
+from snn_fusion_failure.sweeps.results import Found, Reader
+from snn_fusion_failure.sweeps.rungs import is_complete
 
-__all__ = ["gather", "is_complete", "write_netcdf"]
+__all__ = ["RESERVED", "damaged", "gather", "write_netcdf"]
+
+RESERVED = ("seed", "setting", "status", "budget", "source")
+"""Names of the data set's own variables: no axis and no metric can have them."""
 
 
-def gather(sweep: Sweep) -> Any:
+def damaged(sweep: Sweep, reader: Reader | None = None) -> list[Path]:
+    """Chunk files whose checksum is wrong."""
+    reader = reader or Reader(sweep.out)
+    found = []
+    for segment, number in sorted(done_chunks(sweep.out)):
+        try:
+            reader.chunk(segment, number)
+        except DamagedError:
+            found.append(chunk_path(sweep.out, segment, number))
+    return found
+
+
+def gather(sweep: Sweep, *, reader: Reader | None = None) -> Any:
     """An `xarray.Dataset` of what is there.
 
     A grid has a dimension per axis and `seed`; other designs have `setting` and `seed`, with the
     axes as coordinates along `setting`. Each metric is a variable with its unit; `status` says of
-    each trial whether it is ok, not finite, failed (its chunk raised an exception) or missing;
-    `budget` is the largest budget that a setting was run on, where settings were dropped.
-    Attributes hold the configuration and the versions that made the numbers.
+    each trial whether it is ok, not finite, failed (it raised an exception) or missing; `budget`
+    is the largest budget that a setting was run on, where settings were dropped; `source` counts
+    the sources, where several made the numbers. Attributes hold the configuration and the versions
+    that made the numbers.
+
+    Raises:
+        DamagedError: the checksum of a chunk is wrong.
     """
     import xarray as xr
 
-    design, study = sweep.design, sweep.study
-    n = sweep.n_trials
-    metrics = {name: np.full(n, np.nan) for name in study.metrics}
-    status = np.full(n, MISSING, np.int8)
-    budget = np.zeros(n, np.int32)
-    seconds, messages = 0.0, {}
-    for step in (*sweep.budgets, None):
-        for number in sorted(done_chunks(sweep, step)):
-            held = load_chunk(chunk_path(sweep, number, step), list(study.metrics))
-            trials = held["trial"]
-            seconds += held["seconds"]
-            if held["message"]:
-                messages[f"{number}" if step is None else f"{step}/{number}"] = held["message"]
-            # A dropped setting keeps the numbers of its last rung out of the metrics: they were
-            # made with less training and are no answer to the same question.
-            if step is None:
-                status[trials] = held["status"]
-                for name in metrics:
-                    metrics[name][trials] = held[name]
-            else:
-                budget[trials] = step
-    if sweep.budgets:
-        budget[status != MISSING] = np.iinfo(np.int32).max
+    reader = reader or Reader(sweep.out)
+    plan = read_plan(sweep.out)
+    rows = [tuple(row) for part in plan for row in part["rows"]]
+    segments = segments_of(plan)
+    found = reader.found(sweep, segments, len(rows), None)
+    dims, coords, order = _coordinates(sweep, rows)
+    shape = tuple(len(coords[d]) if d == "seed" else coords[d][1].shape[0] for d in dims)
 
-    names = [axis.leaf for axis in design.axes]
-    if design.kind == "grid":
-        dims = (*names, "seed")
-        coords: dict[str, Any] = {
-            axis.leaf: (axis.leaf, np.asarray(axis.values), {"units": axis.unit or "1"})
-            for axis in design.axes
-        }
-    else:
-        dims = ("setting", "seed")
-        coords = {
-            axis.leaf: ("setting", design.values[:, i], {"units": axis.unit or "1"})
-            for i, axis in enumerate(design.axes)
-        }
-        coords["setting"] = np.arange(design.n)
-    coords["seed"] = np.arange(sweep.seeds)
-    shape = (*design.shape, sweep.seeds)
+    def placed(values: np.ndarray) -> np.ndarray:
+        return values[order].reshape(shape)
+
     variables: dict[str, Any] = {}
-    for name, metric in study.metrics.items():
+    for name, metric in sweep.metrics.items():
         attributes = {"units": metric.unit or "1", "long_name": metric.text, "goal": metric.goal}
-        variables[name] = (dims, metrics[name].reshape(shape), attributes)
+        variables[name] = (dims, placed(found.metrics[name]), attributes)
     flags = {"flag_values": np.arange(len(STATUS), dtype=np.int8),
              "flag_meanings": " ".join(s.replace("-", "_") for s in STATUS)}  # fmt: skip
-    variables["status"] = (dims, status.reshape(shape), {"long_name": "how a trial ended", **flags})
+    variables["status"] = (dims, placed(found.status), {"long_name": "how a trial ended", **flags})
+    if len(found.sources) > 1:
+        text = {"long_name": "which source made a trial, see attribute sources; -1: none"}
+        variables["source"] = (dims, placed(found.source), text)
     if sweep.budgets:
-        text = f"{study.budget_text} a trial was run on; the largest number: all of them"
-        variables["budget"] = (dims, budget.reshape(shape), {"long_name": text})
+        budget = _budgets(sweep, segments, found, reader, len(rows))
+        text = {"long_name": f"{sweep.budget_text} a trial was run on; the largest: all of them"}
+        variables["budget"] = (dims, placed(budget), text)
+    return xr.Dataset(variables, coords, _about(sweep, plan, found, reader))
+
+
+def _coordinates(sweep: Sweep, rows: list[tuple[Any, ...]]) -> Any:
+    """Dimensions, coordinates, and the settings in the data set's order."""
+    design = sweep.design
+    numbers = {digest(sweep.leaves, row): i for i, row in enumerate(rows)}
+
+    def values_of(values: Any) -> np.ndarray:
+        words = any(isinstance(v, str) for v in values)
+        return np.asarray([str(v) for v in values] if words else list(values))
+
+    def attributes(axis: Any) -> dict[str, Any]:
+        return {"units": axis.unit or "1", "kind": axis.kind, "log": int(axis.log)}
+
+    coords: dict[str, Any] = {}
+    grid = design.kind == "grid" and design.axes
+    if grid:
+        import itertools
+
+        wanted = itertools.product(*(axis.values for axis in design.axes))
+        order = np.asarray([numbers[digest(sweep.leaves, row)] for row in wanted], int)
+        dims = (*sweep.leaves, "seed")
+        for axis in design.axes:
+            coords[axis.leaf] = (axis.leaf, values_of(axis.values), attributes(axis))
+    else:
+        order = np.arange(len(rows))
+        dims = ("setting", "seed")
+        coords["setting"] = ("setting", np.arange(len(rows)))
+        for i, axis in enumerate(design.axes):
+            column = values_of([row[i] for row in rows])
+            coords[axis.leaf] = ("setting", column, attributes(axis))
+    coords["seed"] = np.arange(sweep.seeds)
+    return dims, coords, order
+
+
+def _budgets(
+    sweep: Sweep, segments: Any, found: Found, reader: Reader, n_settings: int
+) -> np.ndarray:
+    """How far each trial came."""
+    budget = np.zeros(found.status.shape, np.int32)
+    for step in sweep.budgets:
+        below = reader.found(sweep, segments, n_settings, step)
+        budget[below.status != MISSING] = step
+    budget[found.status != MISSING] = np.iinfo(np.int32).max
+    return budget
+
+
+def _about(sweep: Sweep, plan: Any, found: Found, reader: Reader) -> dict[str, Any]:
     claimed = json.loads((sweep.out / "sweep.json").read_text(encoding="utf-8"))
-    made = {k: v for k, v in claimed.items() if k not in ("settings", "layout")}
-    about: dict[str, Any] = {
-        "title": f"sweep of study {study.name}",
-        "objective": study.objective,
-        "config": json.dumps({k: v for k, v in claimed["settings"].items() if k != "values"}),
+    made = {k: claimed[k] for k in ("command", "git", "versions", "device", "date", "packages")}
+    made["parts"] = [part["command"] for part in plan]
+    config = {**claimed["settings"], "design": sweep.design.describe(), "seeds": sweep.seeds}
+    sources = {}
+    for name in found.sources:
+        path = sweep.out / "sources" / f"{name}.json"
+        about = json.loads(path.read_text(encoding="utf-8")) if path.exists() else {}
+        sources[name] = {k: v for k, v in about.items() if k not in ("sources", "id")}
+    planned_chunks = all_chunks(sweep)
+    done = {x for x in done_chunks(sweep.out) if not reader.skips(*x)}
+    return {
+        "title": f"sweep of study {sweep.study_name}",
+        "objective": sweep.objective,
+        "min_valid": sweep.min_valid,
+        "config": json.dumps(config),
         "layout": json.dumps(claimed["layout"]),
         "provenance": json.dumps(made),
-        "complete": int(is_complete(sweep)),
-        "compute_seconds": seconds,
-        "failures": json.dumps(messages),
+        "sources": json.dumps(sources),
+        "mixed": int(len(found.sources) > 1),
+        "devices": "; ".join(found.devices),
+        "complete": int(is_complete(sweep, reader)),
+        "chunks": len(planned_chunks),
+        "chunks_missing": sum((s.number, c) not in done for s, c in planned_chunks),
+        "common_seeds": int(sweep.common),
+        "compute_seconds": found.seconds,
+        "failures": json.dumps({f"{s}/{k}": m for (s, k), m in sorted(found.messages.items())}),
+        "notes": json.dumps(found.notes),
     }
-    return xr.Dataset(variables, coords, about)
-
-
-def is_complete(sweep: Sweep) -> bool:
-    """Whether all chunks of all rungs are there."""
-    rung = next_rung(sweep)
-    return rung.budget is None and len(done_chunks(sweep)) >= rung.n_chunks(sweep)
 
 
 def write_netcdf(dataset: Any, path: Path) -> None:
     """Write a data set as netCDF 3 (64-bit offsets), which every reader knows, atomically."""
-    handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-    os.close(handle)
-    try:
-        dataset.to_netcdf(temporary, engine="scipy", format="NETCDF3_64BIT")
-        os.replace(temporary, path)
-    except BaseException:
-        Path(temporary).unlink(missing_ok=True)
-        raise
+    data = dataset.to_netcdf(None, engine="scipy", format="NETCDF3_64BIT")
+    write_bytes(path, bytes(data))

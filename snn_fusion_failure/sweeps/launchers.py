@@ -1,13 +1,14 @@
 """More than one process: local workers, Ray actors, SLURM arrays. All fill the same folder.
 
 What is started only needs the folder: the sweep is read from it. Nothing is lost with a worker but
-the chunk that it was in.
+the chunk that it was in, and that is taken over by another one.
 """
 
 from __future__ import annotations
 
 import logging
 import os
+import signal
 import subprocess
 import sys
 import time
@@ -15,60 +16,81 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.runs import enable_compilation_cache, repository
-from snn_fusion_failure.sweeps.chunks import Rung, Worker, next_rung, run_shard
-from snn_fusion_failure.sweeps.folder import Sweep, done_chunks, held_sweep
+from snn_fusion_failure.runs import enable_compilation_cache
+from snn_fusion_failure.sweeps import leases
+from snn_fusion_failure.sweeps.chunks import Progress, run_shard
+from snn_fusion_failure.sweeps.folder import (
+    Sweep,
+    all_chunks,
+    chunk_name,
+    chunk_path,
+    done_chunks,
+    held_sweep,
+    read_plan,
+    segments_of,
+)
+from snn_fusion_failure.sweeps.results import Reader
+from snn_fusion_failure.sweeps.rungs import next_work
+from snn_fusion_failure.sweeps.worker import Worker
 
-__all__ = ["OnChunk", "launch_local", "launch_ray", "launch_submitit", "work"]
+__all__ = ["OnChunk", "launch_local", "launch_ray", "launch_submitit", "standing", "work"]
 
-# (rung, chunks that are there, chunks in all, what went wrong)
-OnChunk = Callable[[Rung, int, int, str], None]
+OnChunk = Callable[[Progress], None]
 _POLL = 0.5  # seconds between looks into the folder
 _CHILD = """
-import sys
+import signal, sys
+signal.signal(signal.SIGINT, signal.SIG_IGN)  # Ctrl-C is for the parent, which ends its workers
 from snn_fusion_failure.sweeps.launchers import work
-work(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]))
+work(sys.argv[1], int(sys.argv[2]), int(sys.argv[3]), sys.argv[4] == "mixed", float(sys.argv[5]))
 """
 
 
-def work(out: str, shard: int, shards: int) -> bool:
-    """What a started process does: its shard of the sweep in a folder."""
+def work(out: str, shard: int, shards: int, allow_mixed: bool = False, lease: float = 60.0) -> bool:
+    """What a started process does: chunks of the sweep in a folder, until none is left."""
     enable_compilation_cache()
-    return run_shard(held_sweep(Path(out)), shard=shard, shards=shards)
+    sweep = held_sweep(Path(out), load=True, allow_mixed=allow_mixed, lease=lease)
+    return run_shard(sweep, shard=shard, shards=shards).complete
+
+
+def standing(sweep: Sweep) -> Progress:
+    """How many of the planned chunks are there."""
+    planned = {(s.number, c) for s, c in all_chunks(sweep)}
+    return Progress(None, len(planned & done_chunks(sweep.out)), len(planned))
 
 
 def launch_local(sweep: Sweep, workers: int, on_chunk: OnChunk) -> list[str]:
-    """`workers` processes on this machine, one shard each; a rung at a time.
+    """`workers` processes on this machine, which share the chunks by leases.
 
     Returns:
-        What was wrong with processes that ended badly; their chunks are left for the next run.
+        What was wrong with processes that ended badly; the others did their chunks.
     """
-    errors: list[str] = []
-    while not errors:
-        rung = next_rung(sweep)
-        total = rung.n_chunks(sweep)
-        if len(done_chunks(sweep, rung.budget)) >= total:
-            break
-        processes = [
-            subprocess.Popen(
-                [sys.executable, "-c", _CHILD, str(sweep.out), str(i), str(workers)],
-                cwd=repository.ROOT, stdout=sys.stderr,
-            )
-            for i in range(workers)
-        ]  # fmt: skip
-        try:
-            while any(p.poll() is None for p in processes):
-                on_chunk(rung, len(done_chunks(sweep, rung.budget)), total, "")
-                time.sleep(_POLL)
-        finally:
-            for process in processes:
-                process.terminate()
-                process.wait()
-        on_chunk(rung, len(done_chunks(sweep, rung.budget)), total, "")
-        for i, process in enumerate(processes):
-            if process.returncode:
-                errors.append(f"worker {i} ended with status {process.returncode}")
-    return errors
+    out = str(sweep.out.resolve())
+    mixed = "mixed" if sweep.allow_mixed else "one"
+    # The study is found where this process finds it, whatever the current directory is.
+    path = os.pathsep.join(dict.fromkeys(p or os.getcwd() for p in sys.path))
+    processes = [
+        subprocess.Popen(
+            [sys.executable, "-c", _CHILD, out, str(i), str(workers), mixed, str(sweep.lease)],
+            stdout=sys.stderr, env={**os.environ, "PYTHONPATH": path},
+        )
+        for i in range(workers)
+    ]  # fmt: skip
+    try:
+        while any(p.poll() is None for p in processes):
+            on_chunk(standing(sweep))
+            time.sleep(_POLL)
+    finally:
+        for process in processes:
+            if process.poll() is None:
+                process.send_signal(signal.SIGTERM)
+        for process in processes:
+            process.wait()
+    on_chunk(standing(sweep))
+    return [
+        f"worker {i} ended with status {p.returncode}"
+        for i, p in enumerate(processes)
+        if p.returncode
+    ]
 
 
 def launch_submitit(
@@ -79,7 +101,7 @@ def launch_submitit(
     cluster: str | None = None,
     parameters: dict[str, Any] | None = None,
 ) -> list[str]:
-    """A SLURM array of `jobs` shards by submitit, or its local stand-in; a rung at a time.
+    """A SLURM array of `jobs` workers by submitit, or its local stand-in.
 
     Args:
         sweep: claimed.
@@ -90,46 +112,51 @@ def launch_submitit(
             `slurm_partition`, `gpus_per_node` ...).
 
     Returns:
-        What was wrong with jobs that failed; their chunks are left for the next run.
+        What was wrong with jobs that failed; the others did their chunks.
     """
     import submitit
 
-    executor = submitit.AutoExecutor(folder=sweep.out / "jobs", cluster=cluster)
+    out = sweep.out.resolve()
+    executor = submitit.AutoExecutor(folder=out / "jobs", cluster=cluster)
     executor.update_parameters(**{"name": "sweep", "timeout_min": 60, **(parameters or {})})
-    errors: list[str] = []
-    while not errors:
-        rung = next_rung(sweep)
-        total = rung.n_chunks(sweep)
-        if len(done_chunks(sweep, rung.budget)) >= total:
-            break
-        # A name, not the function: nothing of this process but numbers is pickled.
-        array = executor.map_array(work, [str(sweep.out)] * jobs, range(jobs), [jobs] * jobs)
-        try:
-            while not all(job.done() for job in array):
-                on_chunk(rung, len(done_chunks(sweep, rung.budget)), total, "")
-                time.sleep(_POLL)
-        except KeyboardInterrupt:
-            for job in array:
-                job.cancel()
-            raise
-        on_chunk(rung, len(done_chunks(sweep, rung.budget)), total, "")
+    # A name, not the function: nothing of this process but numbers is pickled.
+    array = executor.map_array(
+        work, [str(out)] * jobs, range(jobs), [jobs] * jobs, [sweep.allow_mixed] * jobs,
+        [sweep.lease] * jobs,
+    )  # fmt: skip
+    try:
+        while not all(job.done() for job in array):
+            on_chunk(standing(sweep))
+            time.sleep(_POLL)
+    except KeyboardInterrupt:
         for job in array:
-            error = job.exception()
-            if error is not None:
-                errors.append(f"job {job.job_id}: {str(error).strip().splitlines()[-1]}")
-    return errors
+            job.cancel()
+        raise
+    on_chunk(standing(sweep))
+    failures = [(job.job_id, job.exception()) for job in array]
+    return [f"job {i}: {str(e).strip().splitlines()[-1]}" for i, e in failures if e is not None]
 
 
 class _Actor:
-    """A Ray actor: keeps its compiled program between chunks."""
+    """A Ray actor: keeps its compiled programs between chunks."""
 
-    def __init__(self, out: str) -> None:
+    def __init__(self, out: str, allow_mixed: bool, lease: float) -> None:
         enable_compilation_cache()
-        self._worker = Worker(held_sweep(Path(out)))
+        self._sweep = held_sweep(Path(out), load=True, allow_mixed=allow_mixed, lease=lease)
+        self._worker = Worker(self._sweep)
 
-    def run(self, rung: Rung, number: int) -> tuple[int, int, str]:
-        message = self._worker.run(rung, number)
-        return number, os.getpid(), message
+    def run(self, segment: int, number: int) -> tuple[int, list[str]]:
+        """Run a chunk unless it is there, or somebody outside of Ray has it."""
+        made = segments_of(read_plan(self._sweep.out))[segment]
+        if chunk_path(self._sweep.out, segment, number).exists():
+            return os.getpid(), []
+        lease = leases.take(self._sweep.out, chunk_name(segment, number), self._sweep.lease)
+        if lease is None:
+            return os.getpid(), []
+        try:
+            return os.getpid(), self._worker.run(made, number)
+        finally:
+            lease.release()
 
 
 def launch_ray(
@@ -145,8 +172,8 @@ def launch_ray(
 ) -> list[str]:
     """Ray actors that take the next chunk whenever they are free.
 
-    An actor that dies is replaced and its chunk is given to another one, up to `deaths` times per
-    chunk: a chunk that kills whoever touches it must not stop the rest.
+    Scheduling and faults are Ray's: an actor whose process or node is lost is restarted (elsewhere,
+    if it has to be) and its chunk is tried again, up to `deaths` times.
 
     Args:
         sweep: claimed, in a folder that all nodes see.
@@ -154,7 +181,7 @@ def launch_ray(
         on_chunk: see `run_shard`.
         address: of a running Ray cluster ("auto" finds it); None starts one on this machine.
         cpus, gpus: what an actor asks for.
-        deaths: actors that a chunk may cost.
+        deaths: restarts of an actor and tries of a chunk.
         on_pid: called with the process id of the actor that ended a chunk.
 
     Returns:
@@ -162,7 +189,7 @@ def launch_ray(
     """
     os.environ.setdefault("RAY_ACCEL_ENV_VAR_OVERRIDE_ON_ZERO", "0")
     import ray
-    from ray.exceptions import RayActorError
+    from ray.exceptions import RayError
 
     options: dict[str, Any] = {"address": address}
     if address is None:
@@ -172,48 +199,52 @@ def launch_ray(
             "include_dashboard": False,
             "_node_ip_address": "127.0.0.1",
         }
-    ray.init(
-        log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True, **options
-    )
+    path = os.pathsep.join(dict.fromkeys(p or os.getcwd() for p in sys.path))
+    context = ray.init(
+        log_to_driver=False, logging_level=logging.WARNING, ignore_reinit_error=True,
+        runtime_env={"env_vars": {"PYTHONPATH": path}}, **options,
+    )  # fmt: skip
+    if getattr(context, "dashboard_url", None):
+        print(f"Ray dashboard: http://{context.dashboard_url}", file=sys.stderr)
     errors: list[str] = []
     try:
-        # Ray's own restarts would hide a death; the loop below has to see it to count it.
-        actor: Any = ray.remote(num_cpus=cpus, num_gpus=gpus, max_restarts=0)(_Actor)
-        crew = [actor.remote(str(sweep.out)) for _ in range(workers)]
+        actor: Any = ray.remote(
+            num_cpus=cpus, num_gpus=gpus, max_restarts=deaths, max_task_retries=deaths
+        )(_Actor)
+        out = str(sweep.out.resolve())
+        crew = [actor.remote(out, sweep.allow_mixed, sweep.lease) for _ in range(workers)]
+        reader, given_up = Reader(sweep.out), set()
         while True:
-            rung = next_rung(sweep)
-            total = rung.n_chunks(sweep)
-            done = done_chunks(sweep, rung.budget)
-            waiting = [c for c in range(total) if c not in done]
-            lost: dict[int, int] = {}
-            running: dict[Any, tuple[int, int]] = {}
+            planned = [(s.number, c) for s, c in all_chunks(sweep)]
+            done = done_chunks(sweep.out)
+            waiting = [x for x in planned if x not in done and x not in given_up]
+            if not waiting:
+                if given_up or not next_work(sweep, reader):
+                    return errors
+                continue
+            free, running = list(crew), {}
             while waiting or running:
-                busy = {place for place, _ in running.values()}
-                for place in range(workers):
-                    if waiting and place not in busy:
-                        number = waiting.pop(0)
-                        running[crew[place].run.remote(rung, number)] = (place, number)
+                while waiting and free:
+                    one, place = free.pop(), waiting.pop(0)
+                    running[one.run.remote(*place)] = (one, place)
                 ready, _ = ray.wait(list(running), num_returns=1)
-                place, number = running.pop(ready[0])
+                one, place = running.pop(ready[0])
                 try:
-                    _, pid, message = ray.get(ready[0])
-                except RayActorError as error:
-                    crew[place] = actor.remote(str(sweep.out))
-                    # It may have died between the file and the answer.
-                    if number in done_chunks(sweep, rung.budget):
-                        continue
-                    lost[number] = lost.get(number, 0) + 1
-                    if lost[number] < deaths:
-                        waiting.insert(0, number)
-                    else:
-                        first = str(error).strip().splitlines()[0]
-                        errors.append(f"chunk {number} given up after {deaths} deaths: {first}")
+                    pid, messages = ray.get(ready[0])
+                except RayError as error:
+                    given_up.add(place)
+                    first = str(error).strip().splitlines()[0]
+                    name = chunk_name(*place)
+                    errors.append(f"chunk {name} given up after {deaths} deaths: {first}")
+                    crew.remove(one)
+                    crew.append(actor.remote(out, sweep.allow_mixed, sweep.lease))
+                    free.append(crew[-1])
                     continue
-                done.add(number)
-                on_chunk(rung, len(done), total, message)
+                free.append(one)
+                errors += messages
+                now = standing(sweep)
+                on_chunk(Progress(None, now.done, now.total, tuple(messages)))
                 if on_pid is not None:
                     on_pid(pid)
-            if errors or rung.budget is None:
-                return errors
     finally:
         ray.shutdown()

@@ -102,20 +102,21 @@ def batch(
     """A tree like `params` whose leaves are `[n]` arrays: a column where there is one.
 
     Args:
-        params: the study's own constants.
+        params: the study's own constants; a whole number stays one (int32).
         columns: leaf name -> values in the axis' unit, `[n]`.
         n: trials.
         units: unit of an axis, by leaf.
-        dtype: of the arrays.
+        dtype: of the other arrays.
     """
     import jax
 
     leaves, tree = jax.tree.flatten(params)
     filled = []
     for name, leaf in zip(leaf_names(params), leaves, strict=True):
+        kind = "int32" if isinstance(leaf, int) and not isinstance(leaf, bool) else dtype
         if name in columns:
             values = np.asarray(columns[name], np.float64) * UNITS.get(units.get(name, ""), 1.0)
         else:
             values = np.full(n, float(leaf))
-        filled.append(values.astype(dtype))
+        filled.append(values.astype(kind))
     return jax.tree.unflatten(tree, filled)

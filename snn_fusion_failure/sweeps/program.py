@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from typing import Any
 
 import numpy as np
@@ -16,21 +16,36 @@ import numpy as np
 from snn_fusion_failure.sweeps.leaves import batch
 from snn_fusion_failure.sweeps.study import Study
 
-__all__ = ["Program", "compile_study", "fastest", "measure_widths", "widths_to_try"]
+__all__ = [
+    "Program", "compile_study", "fastest", "measure_widths", "out_of_memory", "widths_to_try",
+]  # fmt: skip
 
-# (columns {leaf: [n]}, trial numbers [n]) -> {metric: [n]} float64
-Program = Callable[[Mapping[str, np.ndarray], np.ndarray], dict[str, np.ndarray]]
+
+# (columns {leaf: [n]}, words [n, 2], seeds [n], carry) -> {metric: [n]} float64, carry leaves
+Program = Callable[..., tuple[dict[str, np.ndarray], list[np.ndarray]]]
 
 
-def compile_study(study: Study, *, root: int, width: int) -> Program:
+def compile_study(
+    study: Study,
+    *,
+    root: int,
+    width: int,
+    common: bool = False,
+    span: tuple[int, int] | None = None,
+) -> Program:
     r"""Compile a study once; the result runs any list of trials.
 
-    Trial :math:`i` gets the key `fold_in(key(root), i)`.
+    Seed :math:`k` of a setting whose digest is :math:`(a, b)` gets the key
+    `fold_in(fold_in(fold_in(key(root), a), b), k)`: it follows from what the setting is, not from
+    where it stands in a design.
 
     Args:
         study: what a trial is.
         root: seed of the sweep.
         width: trials side by side on one device; 1 maps, all vmaps.
+        common: leave the setting out of the key, so that all settings draw the same numbers.
+        span: the units of training to run, for a study that can be gone on with (`Study.carry`);
+            from 0 on it starts the trials.
 
     Returns:
         Program. With several devices (of several processes, after `jax.distributed.initialize`)
@@ -43,27 +58,38 @@ def compile_study(study: Study, *, root: int, width: int) -> Program:
     from jax.sharding import AxisType, Mesh, NamedSharding, PartitionSpec
 
     if width < 1:
-        raise ValueError(f"chunk size {width}: expected at least one trial side by side")
+        raise ValueError(f"chunk_size={width}: expected at least one trial side by side")
     devices = jax.devices()
     mesh = Mesh(np.asarray(devices), ("trial",), axis_types=(AxisType.Auto,))
     spread = PartitionSpec("trial")
     sharding = NamedSharding(mesh, spread)
     size = width * len(devices)
 
-    def on_device(params: Any, numbers: Any) -> dict[str, Any]:
-        keys = jax.vmap(lambda i: jax.random.fold_in(jax.random.key(root), i))(numbers)
-        return study.run(params, keys)
+    def key_of(words: Any, seed: Any) -> Any:
+        key = jax.random.key(root)
+        if not common:
+            key = jax.random.fold_in(jax.random.fold_in(key, words[0]), words[1])
+        return jax.random.fold_in(key, seed)
+
+    def on_device(params: Any, words: Any, seeds: Any, carry: Any) -> tuple[dict[str, Any], Any]:
+        keys = jax.vmap(key_of)(words, seeds)
+        if span is None:
+            return study.run(params, keys), ()
+        assert study.carry is not None
+        if span[0] == 0:
+            carry = study.carry.init(params, keys)
+        carry, metrics = study.carry.advance(params, keys, carry, *span)
+        return metrics, carry
 
     run = jax.jit(
-        jax.shard_map(
-            on_device, mesh=mesh, in_specs=(spread, spread), out_specs=spread, check_vma=False
-        )
+        jax.shard_map(on_device, mesh=mesh, in_specs=spread, out_specs=spread, check_vma=False)
     )
 
     def scope() -> Any:
         return jax.enable_x64(True) if study.dtype == "float64" else contextlib.nullcontext()
 
-    def to_devices(values: np.ndarray) -> Any:
+    def to_devices(values: Any) -> Any:
+        values = np.asarray(values)
         return jax.make_array_from_callback(values.shape, sharding, lambda index: values[index])
 
     def to_host(values: Any) -> np.ndarray:
@@ -71,11 +97,29 @@ def compile_study(study: Study, *, root: int, width: int) -> Program:
             from jax.experimental import multihost_utils
 
             values = multihost_utils.process_allgather(values, tiled=True)
-        return np.asarray(values, np.float64)
+        return np.asarray(values)
 
-    def call(columns: Mapping[str, np.ndarray], numbers: np.ndarray) -> dict[str, np.ndarray]:
-        n = len(numbers)
-        units = {leaf: study.unit_of(leaf) for leaf in study.leaves}
+    units = {leaf: study.unit_of(leaf) for leaf in study.leaves}
+    trees: list[Any] = []
+
+    def structure(params: Any, words: Any, seeds: Any) -> Any:
+        """What the carry looks like as a tree; files hold its leaves."""
+        if not trees:
+            assert study.carry is not None
+            shape = jax.eval_shape(
+                lambda p, w, s: study.carry.init(p, jax.vmap(key_of)(w, s)),  # type: ignore[union-attr]
+                params, words, seeds,
+            )  # fmt: skip
+            trees.append(jax.tree.structure(shape))
+        return trees[0]
+
+    def call(
+        columns: Mapping[str, np.ndarray],
+        words: np.ndarray,
+        seeds: np.ndarray,
+        carry: Sequence[np.ndarray] = (),
+    ) -> tuple[dict[str, np.ndarray], list[np.ndarray]]:
+        n = len(seeds)
         pending = []
         with scope():
             for start in range(0, n, size):
@@ -84,10 +128,26 @@ def compile_study(study: Study, *, root: int, width: int) -> Program:
                 index = np.where(index < n, index, index % n)
                 part = {leaf: values[index] for leaf, values in columns.items()}
                 params = batch(study.params, part, size, units, study.dtype)
-                inputs = jax.tree.map(to_devices, (params, numbers[index].astype(np.int32)))
-                pending.append(run(*inputs))
-            parts = [{name: to_host(out[name]) for name in study.metrics} for out in pending]
-        return {name: np.concatenate([p[name] for p in parts])[:n] for name in study.metrics}
+                inputs = jax.tree.map(
+                    to_devices, (params, words[index], seeds[index].astype(np.int32))
+                )
+                held: Any = ()
+                if carry:
+                    tree = structure(*inputs)
+                    leaves = [to_devices(leaf[index]) for leaf in carry]
+                    held = jax.tree.unflatten(tree, leaves)
+                pending.append(run(*inputs, held))
+            parts = [
+                ({name: to_host(out[name]) for name in study.metrics},
+                 [to_host(leaf) for leaf in jax.tree.leaves(state)])
+                for out, state in pending
+            ]  # fmt: skip
+        metrics = {
+            name: np.concatenate([p[name] for p, _ in parts])[:n].astype(np.float64)
+            for name in study.metrics
+        }
+        states = [np.concatenate(leaves)[:n] for leaves in zip(*(s for _, s in parts), strict=True)]
+        return metrics, states
 
     return call
 
@@ -108,18 +168,20 @@ def widths_to_try(most: int) -> list[int]:
 def measure_widths(
     study: Study,
     columns: Mapping[str, np.ndarray],
-    numbers: np.ndarray,
+    words: np.ndarray,
+    seeds: np.ndarray,
     *,
     root: int,
     clock: Callable[[], float] = time.perf_counter,
 ) -> dict[int, float]:
     """Seconds per trial of each width, measured on trials of the sweep itself.
 
-    Stops when a width is slower than half as fast as the best one: beyond it only gets worse.
+    Stops when a width is slower than half as fast as the best one, or when memory runs out: beyond
+    it only gets worse.
 
     Args:
         study: what a trial is.
-        columns, numbers: the trials to try; the widths go up to their number per device.
+        columns, words, seeds: the trials to try; the widths go up to their number per device.
         root: seed of the sweep.
         clock: in seconds.
     """
@@ -127,17 +189,29 @@ def measure_widths(
 
     seconds: dict[int, float] = {}
     devices = len(jax.devices())
-    for width in widths_to_try(max(1, len(numbers) // devices)):
+    for width in widths_to_try(max(1, len(seeds) // devices)):
         program = compile_study(study, root=root, width=width)
         size = width * devices
         few = {leaf: values[:size] for leaf, values in columns.items()}
-        program(few, numbers[:size])  # compiles
-        start = clock()
-        program(few, numbers[:size])
-        seconds[width] = (clock() - start) / min(size, len(numbers))
+        try:
+            program(few, words[:size], seeds[:size])  # compiles
+            start = clock()
+            program(few, words[:size], seeds[:size])
+        except Exception:
+            # No memory for more, or a trial that raises, which is a matter for its chunk.
+            return seconds or {1: float("inf")}
+        seconds[width] = (clock() - start) / min(size, len(seeds))
         if seconds[width] > 2.0 * min(seconds.values()):
             break
     return seconds
+
+
+def out_of_memory(error: BaseException) -> bool:
+    """Whether an exception of a device or the allocator says that memory ran out."""
+    text = f"{type(error).__name__}: {error}"
+    return isinstance(error, MemoryError) or "RESOURCE_EXHAUSTED" in text or (
+        "out of memory" in text.lower()
+    )  # fmt: skip
 
 
 def fastest(seconds: Mapping[int, float], *, slack: float = 0.05) -> int:

@@ -1,22 +1,25 @@
 """What a sweep sweeps: a study is a pure batched function of parameters and keys.
 
-Built-in studies are found by name; a study of your own by `package.module:function`, where the
-function takes keyword options and returns a `Study`.
+Built-in studies are found by name; your own by `module:function` or `folder/file.py:function`, in
+the current directory or on the path. The function is a trial, `(params, key) -> {metric: number}`,
+or it takes keyword options and returns a `Study`.
 """
 
 from __future__ import annotations
 
 import dataclasses
-import importlib
 import inspect
 import json
 import math
 from collections.abc import Callable, Sequence
 from typing import Any, Literal
 
-from snn_fusion_failure.sweeps.leaves import leaf_names
+from snn_fusion_failure.sweeps.leaves import leaf_names, resolve
 
-__all__ = ["STUDIES", "Metric", "Study", "load_study", "parse_options", "parse_pairs"]
+__all__ = [
+    "STUDIES", "Carry", "Metric", "Study", "is_trial", "load_study", "make_study", "options_of",
+    "parse_options", "parse_pairs",
+]  # fmt: skip
 
 # name -> where it is made
 STUDIES = {
@@ -31,12 +34,33 @@ STUDIES = {
 class Metric:
     """One number per trial."""
 
-    unit: str
-    text: str
+    unit: str = ""
+    text: str = ""
     goal: Literal["max", "min", ""] = ""
     """Which way is better; empty for a number that is not ranked by."""
     optional: bool = False
     """NaN is an answer ("never arrived"), not a trial that broke."""
+
+    def __post_init__(self) -> None:
+        """Refuse a goal that is none."""
+        if self.goal not in ("max", "min", ""):
+            raise ValueError(f"goal={self.goal!r}: expected 'max', 'min' or ''")
+
+
+@dataclasses.dataclass(frozen=True)
+class Carry:
+    """How a study is gone on with from where a smaller budget ended.
+
+    Attributes:
+        init: `(params [w], keys [w]) -> carry`, leaves `[w, ...]`.
+        advance: `(params, keys, carry, begin, end) -> (carry, metrics)`: the units `begin` to
+            `end - 1`, static numbers. In one go or in parts the result is the same, to the bit.
+        total: the budget of a whole trial.
+    """
+
+    init: Callable[[Any, Any], Any]
+    advance: Callable[[Any, Any, Any, int, int], tuple[Any, dict[str, Any]]]
+    total: int
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,6 +81,9 @@ class Study:
         with_budget: the same study, cut after so many units of training, for successive halving;
             its `objective` must not need what was cut off. None where it makes no sense.
         budget_text: what a unit of the budget is.
+        carry: how a cut trial is gone on with; None where it starts anew.
+        variant: the study with other options, for static axes; None where it has none.
+        source: what its fingerprint starts from: a function or a module's name.
     """
 
     name: str
@@ -70,17 +97,49 @@ class Study:
     dtype: str = "float32"
     with_budget: Callable[[int], Study] | None = None
     budget_text: str = ""
+    carry: Carry | None = None
+    variant: Callable[[dict[str, Any]], Study] | None = None
+    source: Any = None
 
     def __post_init__(self) -> None:
         """Refuse an objective that is not there or has no direction."""
         if self.objective not in self.metrics or not self.metrics[self.objective].goal:
             ranked = [name for name, metric in self.metrics.items() if metric.goal]
-            raise ValueError(f"objective {self.objective!r}: expected one of {', '.join(ranked)}")
+            raise ValueError(f"objective={self.objective!r}: expected one of {', '.join(ranked)}")
 
     @property
     def leaves(self) -> tuple[str, ...]:
-        """Names of what can be swept."""
+        """Names of what can be swept without compiling anew."""
         return leaf_names(self.params)
+
+    def axis_of(self, name: str) -> tuple[str, Any, Any]:
+        """Leaf or option that a name means, the kind of its axis, and its default.
+
+        Raises:
+            ValueError: it is neither; the message lists the leaves.
+        """
+        try:
+            return resolve(name, self.leaves), "float", None
+        except ValueError as error:
+            if self.variant is not None and name in self.options:
+                return name, "static", self.options[name]
+            more = f"; options that can be axes: {', '.join(self.options)}" if self.variant else ""
+            raise ValueError(f"{error}{more}") from None
+
+
+def options_of(make: Callable[..., Any]) -> dict[str, Any]:
+    """Options of a function that makes a study, with their defaults."""
+    return {
+        p.name: list(p.default) if isinstance(p.default, tuple) else p.default
+        for p in inspect.signature(make).parameters.values()
+    }
+
+
+def is_trial(function: Callable[..., Any]) -> bool:
+    """Whether a function is a trial, `(params, key)`, rather than one that makes a study."""
+    parameters = inspect.signature(function).parameters.values()
+    needed = [p for p in parameters if p.default is p.empty and p.kind is not p.KEYWORD_ONLY]
+    return len(needed) == 2
 
 
 def parse_options(texts: Sequence[str], defaults: dict[str, Any], study: str) -> dict[str, Any]:
@@ -120,34 +179,45 @@ def parse_options(texts: Sequence[str], defaults: dict[str, Any], study: str) ->
     return chosen
 
 
+def make_study(make: Callable[..., Study], name: str, options: dict[str, Any]) -> Study:
+    """Call a function that makes a study, with options, and remember how to make it again."""
+    study = make(**options)
+    # The options as asked for make the study again, whatever `make` worked out from them.
+    return dataclasses.replace(
+        study, name=name, options=dict(options), source=make,
+        variant=lambda static: make_study(make, name, {**options, **static}),
+    )  # fmt: skip
+
+
 def load_study(
-    name: str, options: Sequence[str] = (), *, held: dict[str, Any] | None = None
-) -> Study:
+    name: str, options: Sequence[str] = (), *, held: dict[str, Any] | None = None,
+    where: str | None = None,
+) -> Any:  # fmt: skip
     """A study by name, with options as strings, or as the values `held` in a sweep's folder.
+
+    Args:
+        name: of a built-in study, or where a function is.
+        options: `name=value` strings.
+        held: the options themselves.
+        where: folder in which a module of one's own was found.
+
+    Returns:
+        Study; the function itself where it is a trial (it needs a space to become a study).
 
     Raises:
         ValueError: unknown study or option, or options that make no study.
     """
-    where = STUDIES.get(name, name)
-    module, colon, function = where.partition(":")
-    if not colon:
-        raise ValueError(
-            f"study {name!r}: expected one of {', '.join(STUDIES)}, or package.module:function "
-            "that returns a Study"
-        )
-    try:
-        make = getattr(importlib.import_module(module), function)
-    except (ImportError, AttributeError) as error:
-        raise ValueError(f"study {name!r} cannot be loaded: {error}") from error
-    signature = inspect.signature(make)
-    defaults = {
-        p.name: list(p.default) if isinstance(p.default, tuple) else p.default
-        for p in signature.parameters.values()
-    }
-    chosen = held if held is not None else parse_options(options, defaults, name)
-    study: Study = make(**chosen)
-    # The options as asked for make the study again, whatever `make` worked out from them.
-    return dataclasses.replace(study, name=name, options=dict(chosen))
+    from snn_fusion_failure.sweeps.source import find_function
+
+    make = find_function(STUDIES.get(name, name), known=STUDIES, where=where)
+    if is_trial(make):
+        if options or held:
+            given = ", ".join(options) or ", ".join(held or ())
+            raise ValueError(f"options={given}: expected none for a trial; sweep them as axes")
+        return make
+    defaults = options_of(make)
+    return make_study(make, name, held if held is not None else
+                      parse_options(options, defaults, name))  # fmt: skip
 
 
 def parse_pairs(texts: Sequence[str], what: str) -> dict[str, Any]:

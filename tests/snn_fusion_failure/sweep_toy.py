@@ -79,10 +79,10 @@ def work_logged(out: str, log: str) -> None:
     """All missing chunks, with a line in `log` for every chunk that is begun."""
     with open(log, "a", buffering=1) as file:  # one write per line: a kill tears none apart
 
-        def begun(number: int) -> None:
-            file.write(f"{number}\n")
+        def begun(name: str) -> None:
+            file.write(f"{name}\n")
 
-        run_shard(held_sweep(Path(out)), on_start=begun)
+        run_shard(held_sweep(Path(out), load=True), on_start=begun)
 
 
 def load(out: Path) -> xr.Dataset:

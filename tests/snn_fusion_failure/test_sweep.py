@@ -13,9 +13,10 @@ import pytest
 import xarray as xr
 
 from snn_fusion_failure.commands import sweep
-from snn_fusion_failure.sweeps import chunks, folder, gather, program
+from snn_fusion_failure.sweeps import designs, folder, gather, program, rungs
 from snn_fusion_failure.sweeps.chunks import run_shard
-from snn_fusion_failure.sweeps.folder import chunk_path, done_chunks, held_sweep
+from snn_fusion_failure.sweeps.folder import done_chunks, held_sweep
+from snn_fusion_failure.sweeps.results import Reader
 from tests.snn_fusion_failure.sweep_toy import NAME
 
 LIF = sweep.Config(
@@ -63,13 +64,14 @@ def test_chunk_size_does_not_change_numbers(lif, tmp_path, size, per_file) -> No
     same(run(LIF, tmp_path, chunk_size=size, chunk_trials=per_file), lif)
 
 
-def test_numbers_are_those_of_the_key_alone(tmp_path) -> None:
+def test_numbers_are_those_of_the_setting_and_the_seed_alone(tmp_path) -> None:
     data = run(TOY, tmp_path)
     assert data["value"].dims == ("a", "inner.b", "seed")
-    for trial in (0, 7, 23):
-        setting, seed = divmod(trial, 3)
-        a, b = [(a, b) for a in (1.0, 2.0, 3.0, 4.0) for b in (0.0, 10.0)][setting]
-        key = jax.random.fold_in(jax.random.key(0), trial)
+    for a, b, seed in ((1.0, 0.0, 0), (2.0, 0.0, 1), (4.0, 10.0, 2)):
+        first, second = designs.digest(["a", "inner.b"], [a, b])
+        key = jax.random.key(0)
+        for word in (first, second, seed):
+            key = jax.random.fold_in(key, word)
         wanted = a * float(jax.random.normal(key, (4,)).mean()) + b
         got = data["value"].sel({"a": a, "inner.b": b, "seed": seed})
         np.testing.assert_allclose(got, wanted, rtol=1e-6)
@@ -115,12 +117,13 @@ def test_a_sweep_goes_on_and_repeats_nothing(tmp_path) -> None:
 def test_other_settings_are_refused(tmp_path) -> None:
     run(TOY, tmp_path)
     for changes, message in [
-        ({"seeds": 4}, r"seeds: 3 -> 4"),
-        ({"options": ("length=5",)}, r"length: 4 -> 5"),
-        ({"grid": ("a=1,2", "b=0,10")}, r"axes: a=1,2,3,4 inner.b=0,10 -> a=1,2 inner.b=0,10"),
-        ({"root": 1}, r"root: 0 -> 1"),
+        ({"seeds": 2}, r"seeds=2: expected at least the 3 .* grow, not shrink"),
+        ({"options": ("length=5",)}, r"other settings \(length: 4 -> 5.*--overwrite"),
+        ({"grid": ("a=1,2", "b=0,10")}, r"4 settings that are not asked for .*a=1.0,2.0,3.0,4.0"),
+        ({"grid": ("a=1,2,3,4", "time=1")}, r"axes: a inner.b -> a inner.time"),
+        ({"root": 1}, r"other settings \(root: 0 -> 1"),
     ]:
-        with pytest.raises(ValueError, match=rf"other settings \({message}.*--overwrite"):
+        with pytest.raises(ValueError, match=message):
             run(TOY, tmp_path, **changes)
     (tmp_path / "notes.txt").write_text("mine")
     data = run(TOY, tmp_path, seeds=1, overwrite=True)
@@ -146,10 +149,11 @@ def test_a_chunk_that_raises_is_recorded_and_run_again(tmp_path) -> None:
     config = dataclasses.replace(TOY, options=(f"broken_while={flag}",), out=out)
     result = sweep.main(config)
     assert result["complete"] and result["failed"] == 6 and result["trials"] == 24
+    assert result["missing"] == 0
     data = load(out)
     assert (data["status"].sel(a=3.0) == folder.FAILED).all()
     assert np.isnan(data["value"].sel(a=3.0)).all()
-    assert "a is three" in json.loads(data.attrs["failures"])["2"]
+    assert "a is three" in json.loads(data.attrs["failures"])["4/0"]
     assert sweep.main(config)["failed"] == 6  # recorded: not tried again by itself
     flag.unlink()
     assert sweep.main(dataclasses.replace(config, retry_failed=True))["failed"] == 0
@@ -167,9 +171,9 @@ def test_auto_measures_and_notes_it(lif, tmp_path, capsys) -> None:
 def test_auto_stops_where_it_gets_slower() -> None:
     ticks = iter([0.0, 1.0, 0.0, 2.0, 0.0, 80.0])
     study = held_study()
-    columns = {"a": np.arange(64.0)}
+    words = np.zeros((64, 2), np.uint32)
     seconds = program.measure_widths(
-        study, columns, np.arange(64), root=0, clock=lambda: next(ticks)
+        study, {"a": np.arange(64.0)}, words, np.arange(64), root=0, clock=lambda: next(ticks)
     )
     assert seconds == {1: 1.0, 4: 0.5, 16: 5.0}
     assert program.fastest(seconds) == 4
@@ -194,10 +198,9 @@ def test_halving_keeps_the_numbers_of_survivors(tmp_path) -> None:
     assert np.isnan(halved["value"].values[~last.values]).all()
     # Who went on follows from the scores of the rung below.
     held = held_sweep(tmp_path / "halved")
+    found = Reader(held.out).found(held, folder.segments_of(folder.read_plan(held.out)), 8, 1)
+    scores = rungs.setting_scores(found.metrics["value"], found.status, "max", 0.75)
     kept = np.flatnonzero(budget[:, 0] >= 2)
-    from snn_fusion_failure.sweeps import halving
-
-    scores = halving.scores(held, 1, np.arange(24))
     assert set(kept) == set(np.argsort(-scores, kind="stable")[:4])
 
 
@@ -213,12 +216,12 @@ def test_halving_by_shards_is_halving(tmp_path) -> None:
     ("changes", "message"),
     [
         ({"halving": (5, 5)}, "expected growing numbers of normals"),
-        ({"halving": (5,), "keep": 1.0}, "keep = 1.0"),
+        ({"halving": (5,), "keep": 1.0}, "keep=1.0"),
         ({"grid": ()}, "no axis given"),
-        ({"random": ("a=1:2",)}, "grid and random given"),
-        ({"seeds": 0}, "seeds = 0"),
-        ({"chunk_size": "0"}, "chunk size '0'"),
-        ({"shard": "4/4"}, "shard '4/4': expected i/n"),
+        ({"random": ("a=1:2",), "sobol": ("b=1:2",)}, "random and sobol given"),
+        ({"seeds": 0}, "seeds=0"),
+        ({"chunk_size": "0"}, "chunk_size='0'"),
+        ({"shard": "4/4"}, "shard='4/4': expected i/n"),
         ({"shard": "0/4", "workers": 2}, "--shard is one process"),
         ({"grid": ("c=1,2",)}, "'c' is no leaf of this study.*a, inner.b, inner.time"),
         ({"study": "lif", "grid": ("tau_m=0.4",)}, "Euler step would oscillate"),
@@ -236,14 +239,14 @@ def test_claims_at_the_same_time_agree(tmp_path) -> None:
     first = folder.claim(dataclasses.replace(made, width=2, chunk_trials=4))
     second = folder.claim(dataclasses.replace(made, width=3, chunk_trials=6))
     assert (second.width, second.chunk_trials) == (first.width, first.chunk_trials) == (2, 4)
-    assert [p.name for p in tmp_path.iterdir()] == ["sweep.json"]
+    assert [p.name for p in tmp_path.iterdir()] == ["sweep.json"]  # no temporary file is left
     with pytest.raises(ValueError, match="holds no sweep"):
         held_sweep(tmp_path / "nowhere")
 
 
-def test_show(lif, tmp_path, capsys, monkeypatch) -> None:
+def test_show(tmp_path, capsys) -> None:
     run(TOY, tmp_path, options=("bad=4.0",))
-    result = sweep.show(sweep.Show(tmp_path, top=3))
+    result = sweep.show(sweep.Show(tmp_path, top=3))["result"]
     text = capsys.readouterr().out
     assert "18 ok, 6 non-finite, 0 failed, 0 missing" in text
     assert (tmp_path / "heat_a_inner.b.png").stat().st_size > 5000
@@ -255,38 +258,26 @@ def test_show(lif, tmp_path, capsys, monkeypatch) -> None:
     mean = float(data["value"].sel({"a": result["a"], "inner.b": 10.0}).mean())
     assert result["best"] == pytest.approx(mean)
     # Half done: shown as far as it is.
-    chunk_path(held_sweep(tmp_path), 0).unlink()
-    half = sweep.show(sweep.Show(tmp_path, figures=False))
+    folder.chunk_path(tmp_path, 0, 0).unlink()
+    half = sweep.show(sweep.Show(tmp_path, figures=False))["result"]
     assert not half["complete"] and half["trials"] == 18
-    monkeypatch.setattr("sys.argv", ["sweep.py", "show", str(tmp_path / "nothing")])
     with pytest.raises(SystemExit):
-        sweep.run_cli()
+        sweep.cli(["show", str(tmp_path / "nothing")])
     assert "holds no sweep" in capsys.readouterr().err
 
 
 def test_goals_that_count_down_rank_the_other_way(lif) -> None:
-    from snn_fusion_failure.sweeps.show import rank
+    from snn_fusion_failure.sweeps.rank import rank
 
     means = [row["mean"] for row in rank(lif)]
     assert means == sorted(means) and len(means) == 15
 
 
 def test_gather_of_an_empty_folder_is_all_missing(tmp_path) -> None:
-    folder.claim(sweep.build(dataclasses.replace(TOY, out=tmp_path)))
-    data = gather.gather(held_sweep(tmp_path))
+    made = folder.claim(sweep.build(dataclasses.replace(TOY, out=tmp_path)))
+    rungs.grow(made)
+    held = held_sweep(tmp_path, load=True)
+    data = gather.gather(held)
     assert (data["status"] == folder.MISSING).all() and not data.attrs["complete"]
-    assert done_chunks(held_sweep(tmp_path)) == set()
-    assert chunks.next_rung(held_sweep(tmp_path)).budget is None
-    assert run_shard(held_sweep(tmp_path), shard=0, shards=24) is False
-
-
-def test_the_study_of_the_page(tmp_path, monkeypatch) -> None:
-    """The page's example of a study of one's own is one."""
-    page = (Path(sweep.__file__).parent.parent / "docs" / "sweeps.md").read_text()
-    blocks = [part.split("```")[0] for part in page.split("```python\n")[1:]]
-    (code,) = [block for block in blocks if "def make" in block]
-    (tmp_path / "my_study.py").write_text(code)
-    monkeypatch.syspath_prepend(tmp_path)
-    config = sweep.Config(study="my_study:make", grid=("width=1,3",), seeds=4, quiet=True)
-    data = run(config, tmp_path / "out", chunk_size="4")
-    assert (data["spread"].sel(width=3.0) > 1.5 * data["spread"].sel(width=1.0).mean()).all()
+    assert done_chunks(tmp_path) == set()
+    assert not run_shard(held, shard=0, shards=24, exclusive=True).complete

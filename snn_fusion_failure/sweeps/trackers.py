@@ -1,0 +1,149 @@
+"""Trackers: settings and their means sent to TensorBoard, MLflow or W&B as they are finished.
+
+Off by default. A tracker is anything with `log(setting, axes, metrics)` and `close()`; the folder
+stays the only store, and what a tracker misses is never lost.
+"""
+
+from __future__ import annotations
+
+import contextlib
+import time
+from collections.abc import Iterator, Mapping
+from typing import Any, Protocol
+
+from snn_fusion_failure.sweeps.chunkfile import DamagedError
+from snn_fusion_failure.sweeps.folder import MISSING, Sweep
+from snn_fusion_failure.sweeps.gather import gather
+from snn_fusion_failure.sweeps.rank import axis_columns, mean_of, per_setting
+from snn_fusion_failure.sweeps.results import Reader
+
+__all__ = ["TRACKERS", "Tracker", "make_tracker"]
+
+
+class Tracker(Protocol):
+    """Where finished settings are sent."""
+
+    def log(self, setting: int, axes: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """Note a setting of which all seeds have ended."""
+
+    def close(self) -> None:
+        """Write what is left."""
+
+
+class TensorBoard:
+    """Event files under `OUT/tensorboard`, a run per setting with its hyper-parameters."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        from tensorboardX import SummaryWriter
+
+        self._writer = SummaryWriter(str(sweep.out / "tensorboard"))
+
+    def log(self, setting: int, axes: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """A point of each metric at the setting's number, and its values as text."""
+        for name, value in metrics.items():
+            self._writer.add_scalar(name, value, setting)
+        text = ", ".join(f"{k}={v}" for k, v in axes.items())
+        self._writer.add_text("setting", text, setting)
+
+    def close(self) -> None:
+        """Flush the event file."""
+        self._writer.close()
+
+
+class MLflow:
+    """A nested MLflow run per setting."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        import mlflow
+
+        self._mlflow = mlflow
+        mlflow.set_experiment(f"sweep {sweep.study_name}")
+        mlflow.start_run(run_name=sweep.out.name)
+
+    def log(self, setting: int, axes: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """A nested run."""
+        with self._mlflow.start_run(run_name=f"setting {setting}", nested=True):
+            self._mlflow.log_params(dict(axes))
+            self._mlflow.log_metrics(dict(metrics))
+
+    def close(self) -> None:
+        """End the run of the sweep."""
+        self._mlflow.end_run()
+
+
+class WandB:
+    """A W&B run of the sweep with a table of settings."""
+
+    def __init__(self, sweep: Sweep) -> None:
+        import wandb
+
+        self._run = wandb.init(project=f"sweep-{sweep.study_name}", name=sweep.out.name)
+
+    def log(self, setting: int, axes: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
+        """A step."""
+        self._run.log({**{f"axis/{k}": v for k, v in axes.items()}, **metrics}, step=setting)
+
+    def close(self) -> None:
+        """End the run."""
+        self._run.finish()
+
+
+TRACKERS = {
+    "tensorboard": (TensorBoard, "tensorboardX"),
+    "mlflow": (MLflow, "mlflow"),
+    "wandb": (WandB, "wandb"),
+}
+"""Name -> class and the library that it needs."""
+
+
+class _Watcher:
+    """Sends each setting once, when all its seeds have ended."""
+
+    def __init__(self, sweep: Sweep, tracker: Tracker | None, every: float) -> None:
+        self._sweep, self._tracker, self._every = sweep, tracker, every
+        self._reader, self._sent = Reader(sweep.out), set()
+        self._last = 0.0
+
+    def look(self, *, now: bool = False) -> None:
+        """Look for settings that have ended; at most every few seconds."""
+        if self._tracker is None or not (now or time.monotonic() - self._last > self._every):
+            return
+        try:
+            dataset = gather(self._sweep, reader=self._reader)
+        except DamagedError:
+            return
+        status = per_setting(dataset, "status")
+        columns = axis_columns(dataset)
+        for setting in range(len(status)):
+            if setting in self._sent or (status[setting] == MISSING).any():
+                continue
+            self._sent.add(setting)
+            axes = {k: v[setting].item() for k, v in columns.items()}
+            metrics = {m: mean_of(dataset, m, setting) for m in self._sweep.metrics}
+            self._tracker.log(setting, axes, metrics)
+        self._last = time.monotonic()
+
+
+@contextlib.contextmanager
+def make_tracker(name: str, sweep: Sweep, *, every: float = 5.0) -> Iterator[Any]:
+    """Something with `look()`, to be called after chunks; it does nothing without a name.
+
+    Raises:
+        ValueError: the tracker's library is not installed.
+    """
+    tracker: Tracker | None = None
+    if name:
+        kind, library = TRACKERS[name]
+        try:
+            tracker = kind(sweep)
+        except ImportError as error:
+            raise ValueError(
+                f"tracker={name!r}: expected the library {library}; pip install {library}"
+            ) from error
+    watcher = _Watcher(sweep, tracker, every)
+    try:
+        yield watcher
+        watcher.look(now=True)
+    finally:
+        if tracker is not None:
+            tracker.close()

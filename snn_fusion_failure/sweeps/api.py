@@ -100,6 +100,7 @@ def sweep(
 
     Example:
         >>> import tempfile, jax
+        >>> from snn_fusion_failure.sweeps import grid
         >>> def trial(params, key):
         ...     return {"error": params["step"] * jax.random.normal(key) ** 2}
         >>> with tempfile.TemporaryDirectory() as out:

@@ -10,8 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.commands import sweep
-from snn_fusion_failure.sweeps import folder
-from snn_fusion_failure.sweeps.folder import done_chunks, held_sweep
+from snn_fusion_failure.sweeps.folder import done_chunks
 from tests.snn_fusion_failure import sweep_toy
 
 KILLS = 20
@@ -33,12 +32,8 @@ def stamps(out: Path) -> dict[str, tuple[int, int]]:
 def test_twenty_kills_change_nothing(tmp_path) -> None:
     whole, out, log = tmp_path / "whole", tmp_path / "killed", tmp_path / "log"
     sweep.main(dataclasses.replace(CONFIG, out=whole))
-    folder.claim(
-        dataclasses.replace(
-            sweep.build(dataclasses.replace(CONFIG, out=out)), width=2, chunk_trials=2
-        )
-    )
-    total, held = 240, held_sweep(out)
+    sweep.open_sweep(dataclasses.replace(CONFIG, out=out))
+    total = 240
     # A server that has imported everything forks the workers: each start is cheap and clean.
     context: Any = multiprocessing.get_context("forkserver")
     context.set_forkserver_preload(["tests.snn_fusion_failure.sweep_toy"])
@@ -53,7 +48,7 @@ def test_twenty_kills_change_nothing(tmp_path) -> None:
         else:
             # After some chunks, anywhere within the next one: running, writing or renaming.
             wanted = len(before) + rng.randint(1, 6)
-            while len(done_chunks(held)) < wanted and process.is_alive():
+            while len(done_chunks(out)) < wanted and process.is_alive():
                 time.sleep(0.005)
             time.sleep(rng.uniform(0.0, 0.02))
         assert process.is_alive(), "the sweep ended before it could be killed: make it longer"
@@ -70,7 +65,7 @@ def test_twenty_kills_change_nothing(tmp_path) -> None:
     result = sweep.main(dataclasses.replace(CONFIG, out=out))
     assert result["complete"] and result["trials"] == 480
     # The first and the last process ran each chunk once, but for those in flight at a kill.
-    begun = [int(line) for line in log.read_text().splitlines()]
+    begun = log.read_text().splitlines()
     assert len(begun) - len(set(begun)) <= in_flight
     names = ("value", "time", "positive", "status")
     sweep_toy.same(sweep_toy.load(whole), sweep_toy.load(out), *names)

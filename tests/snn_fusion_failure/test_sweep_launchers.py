@@ -10,6 +10,7 @@ import xarray as xr
 
 from snn_fusion_failure.commands import sweep
 from snn_fusion_failure.sweeps import launchers
+from snn_fusion_failure.sweeps.engine import collect
 from tests.snn_fusion_failure.sweep_toy import NAME, load, same
 
 # Ray and submitit warn about what is not ours to mend.
@@ -36,7 +37,7 @@ def test_local_workers(alone, tmp_path) -> None:
 
 
 def test_a_local_worker_that_dies_is_reported(alone, tmp_path) -> None:
-    """Its chunks are left, and the same command does them."""
+    """Its chunk is taken over by the other one; the death is told and counted."""
     die = tmp_path / "die"
     die.touch()
     config = dataclasses.replace(CONFIG, options=("delay=0.02", f"die={die}"), workers=2)
@@ -44,8 +45,9 @@ def test_a_local_worker_that_dies_is_reported(alone, tmp_path) -> None:
     made = sweep.open_sweep(config)
     errors = sweep.run(config, made)
     assert len(errors) == 1 and errors[0].endswith("ended with status -9")
-    assert not sweep.summary(made)["complete"]
-    assert sweep.main(config)["complete"]
+    # The other worker took the dead one's chunk over.
+    assert collect(made)[1]["complete"]
+    assert len(list((made.out / "dead").iterdir())) == 1
     same(load(tmp_path / "out"), alone, *VARIABLES)
 
 
@@ -73,9 +75,9 @@ def test_ray_goes_on_when_a_worker_is_killed(alone, tmp_path, monkeypatch) -> No
 
     counts = []
     errors = launchers.launch_ray(
-        made, 2, lambda rung, done, total, message: counts.append(done), on_pid=kill_first
+        made, 2, lambda progress: counts.append(progress.done), on_pid=kill_first
     )
     assert errors == []
     assert len(set(pids)) >= 2 and pids[0] not in pids[1:]
-    assert sweep.summary(made)["complete"]
+    assert collect(made)[1]["complete"]
     same(load(tmp_path), alone, *VARIABLES)

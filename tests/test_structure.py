@@ -49,7 +49,6 @@ SAME_MEANING = {
 """Module names that may occur more than once, and the one thing they mean."""
 KNOWN_CIRCLES: set[tuple[str, str]] = set()
 KNOWN_LONG = {
-    "sweep",
     "train_argate",
     "train_rl",
     "train_snn",
@@ -122,9 +121,7 @@ def test_a_circle_is_found(tmp_path: Path) -> None:
 def test_a_library_stays_in_its_place(library: str, place: tuple[str, ...]) -> None:
     def allowed(module: str) -> bool:
         if library == "matplotlib":
-            return module.split(".")[-1].endswith("plots") or module in (
-                "snn_fusion_failure.sweeps.show",
-            )
+            return module.split(".")[-1].endswith("plots")
         return module.startswith(place) if place else False
 
     users = [m for m, libraries in GRAPH.outside.items() if library in libraries]

@@ -55,22 +55,26 @@ def write_chunks(folder: str, first: int, count: int, n_trials: int) -> list[flo
     """Seconds that each of `count` chunk files took to write."""
     import numpy as np
 
-    from snn_fusion_failure.sweeps.folder import save_chunk
+    from snn_fusion_failure.sweeps.chunkfile import save_chunk
 
-    trials = np.arange(n_trials)
+    trials = np.stack([np.arange(n_trials)] * 2, 1)
+    words = np.zeros((n_trials, 2), np.uint32)
     metrics = {f"metric{i}": np.random.default_rng(i).random(n_trials) for i in range(4)}
     status = np.zeros(n_trials, np.int8)
     seconds = []
     for number in range(first, first + count):
         start = time.perf_counter()
-        save_chunk(Path(folder) / f"{number:06d}.npz", trials, metrics, status, seconds=1.0)
+        save_chunk(
+            Path(folder) / f"{number:06d}.npz", trials, words, metrics, status, seconds=1.0,
+            messages={}, source="", notes=[], device="",
+        )  # fmt: skip
         seconds.append(time.perf_counter() - start)
     return seconds
 
 
 def chunk_costs(folder: Path, repeats: int) -> dict[str, Any]:
     """Milliseconds per chunk file: written, read, listed; and its size."""
-    from snn_fusion_failure.sweeps.folder import load_chunk
+    from snn_fusion_failure.sweeps.chunkfile import load_chunk
 
     costs: dict[str, Any] = {}
     names = [f"metric{i}" for i in range(4)]
@@ -124,6 +128,7 @@ def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str,
     import xarray as xr  # before the clock runs
 
     from snn_fusion_failure.commands import sweep
+    from snn_fusion_failure.sweeps.engine import collect
 
     found: dict[str, Any] = {}
     for count in workers:
@@ -133,7 +138,7 @@ def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str,
             out=folder / f"sweep{count}",
         )  # fmt: skip
         made = sweep.open_sweep(config)
-        sweep.summary(made)  # loads what gathering needs
+        collect(made)  # loads what gathering needs
         before = resource.getrusage(resource.RUSAGE_CHILDREN)
         own, start = time.process_time(), time.perf_counter()
         errors = sweep.run(config, made)
@@ -141,8 +146,7 @@ def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str,
         if errors:
             raise RuntimeError(f"{count} workers: {errors}")
         cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        computed = sweep.summary(made)
-        assert computed["complete"]
+        assert collect(made)[1]["complete"]
         with xr.open_dataset(made.out / "results.nc") as data:
             inside = float(data.attrs["compute_seconds"])
         found[str(count)] = {

@@ -38,179 +38,26 @@ process, once; then a trial of `snn` takes about 8 CPU-seconds, of `lif` a milli
 
 from __future__ import annotations
 
-import dataclasses
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
-from typing import Any, Literal
+from typing import Any
 
 from snn_fusion_failure.commands.show_sweep import Show, show
+from snn_fusion_failure.commands.sweep_options import Config, check
 from snn_fusion_failure.runs import enable_compilation_cache, progress
 from snn_fusion_failure.runs.command import run_command
-
-
-@dataclasses.dataclass(frozen=True)
-class Config:
-    """What to sweep and where to run it."""
-
-    study: str = "lif"
-    """snn, argate, failure, lif, or module:function (a trial, or it returns a Study)."""
-    options: tuple[str, ...] = ()
-    """Choices of the study, name=value; an unknown name lists the known ones."""
-    grid: tuple[str, ...] = ()
-    """Axes of which every value is visited, leaf=values."""
-    choice: tuple[str, ...] = ()
-    """Axes that compile a program per value (sizes, names), leaf=values."""
-    random: tuple[str, ...] = ()
-    """Axes of random draws, leaf=low:high[:log]."""
-    sobol: tuple[str, ...] = ()
-    """Axes of a scrambled Sobol sequence, leaf=low:high[:log]."""
-    tpe: tuple[str, ...] = ()
-    """Axes of an adaptive design: Optuna's tree-structured Parzen estimator."""
-    cma: tuple[str, ...] = ()
-    """Axes of an adaptive design: CMA-ES."""
-    gp: tuple[str, ...] = ()
-    """Axes of an adaptive design: expected improvement under a Gaussian process."""
-    samples: int = 0
-    """Settings of a design that is not a grid."""
-    batch: int = 8
-    """Settings that an adaptive design asks for at a time."""
-    design_seed: int = 0
-    """Seed of a design that is not a grid."""
-    seeds: int = 8
-    """Trials per setting."""
-    root: int = 0
-    """Seed of all trials."""
-    common_seeds: bool = False
-    """Seed k draws the same numbers in every setting, so that settings compare in pairs."""
-    objective: str | None = None
-    """Metric to rank by; the study's own when left out."""
-    goal: Literal["", "max", "min"] = ""
-    """Which way the objective is better; the study's own when left out."""
-    min_valid: float = 0.75
-    """Share of a setting's seeds that must be valid for it to be ranked."""
-    out: Path = Path("runs/sweep")
-    """The sweep's folder."""
-    overwrite: bool = False
-    """Delete the sweep that is in OUT first."""
-    retry_failed: bool = False
-    """Run trials again that raised an exception."""
-    allow_mixed: bool = False
-    """Go on though the study's source has changed; the results say which trials are whose."""
-    chunk_size: str = "auto"
-    """Trials side by side on a device: 1 (one after another), a number, all, or auto (measured)."""
-    chunk_trials: int = 0
-    """Trials per file, lost at most when killed; default: 16 or a chunk size, whichever is more."""
-    halving: tuple[int, ...] = ()
-    """Drop settings after so many units of training (snn: learning trials), for example 5 10."""
-    asha: tuple[int, ...] = ()
-    """The same without waiting for a whole rung."""
-    keep: float = 0.25
-    """Share of the settings that goes on at each of them."""
-    launcher: Literal["local", "ray", "submitit"] = "local"
-    """What starts the workers."""
-    workers: int = 1
-    """Processes, actors or jobs of the launcher."""
-    lease: float = 60.0
-    """Seconds after which the chunk of a worker that has gone silent is taken over."""
-    shard: str = ""
-    """i/n: run part i (from 0) of n parts and nothing else."""
-    distributed: bool = False
-    """This is one process of a jax.distributed run (see docs/sweeps.md)."""
-    coordinator: str | None = None
-    """host:port of process 0; found by itself under SLURM and on TPU pods, as the next two are."""
-    processes: int | None = None
-    """Processes of the distributed run."""
-    process: int | None = None
-    """Number of this one, from 0."""
-    ray_address: str | None = None
-    """A running Ray cluster; without it Ray is started on this machine."""
-    cpus_per_worker: float = 1.0
-    """CPUs that a Ray actor asks for."""
-    gpus_per_worker: float = 0.0
-    """GPUs that a Ray actor asks for."""
-    cluster: Literal["slurm", "local"] | None = None
-    """Where submitit runs; SLURM where it is installed."""
-    slurm: tuple[str, ...] = ()
-    """Parameters of the jobs, name=value, as submitit names them."""
-    tracker: Literal["", "tensorboard", "mlflow", "wandb"] = ""
-    """Send ranked settings to a tracker as they come; each needs its library."""
-    quiet: bool = False
-    """No progress bar."""
-
-
-_DRAWN = ("random", "sobol", "tpe", "cma", "gp")
-
-
-def read_axes(config: Config) -> tuple[str, list[Any], Any]:
-    """Kind of the design, its axes, and the study."""
-    from snn_fusion_failure.sweeps.api import with_objective
-    from snn_fusion_failure.sweeps.axes import parse_axis
-    from snn_fusion_failure.sweeps.study import Study, load_study
-    from snn_fusion_failure.sweeps.trial import from_trial
-
-    drawn = [k for k in _DRAWN if getattr(config, k)]
-    if len(drawn) > 1 or not (drawn or config.grid or config.choice):
-        raise ValueError(
-            f"{' and '.join(drawn) or 'no axis'} given: give one of --grid, --random, --sobol, "
-            "--tpe, --cma, --gp, for example --grid drive=16:40:13"
-        )
-    loaded = load_study(config.study, config.options)
-    is_study = isinstance(loaded, Study)
-
-    def known(name: str) -> Any:
-        return loaded.axis_of(name)
-
-    def any_name(body: str) -> Any:
-        """Axes of a trial are what is given: words are static, numbers are traced."""
-        words = [part for part in body.split(",") if ":" not in part and not _is_number(part)]
-        return lambda name: (name, "static" if words else "float", None)
-
-    axes = []
-    for kind in ("grid", "choice", *drawn):
-        for text in getattr(config, kind):
-            lookup = known if is_study else any_name(text.partition("=")[2])
-            if kind == "choice":
-                lookup = _static(lookup)
-            unit_of = loaded.unit_of if is_study else (lambda leaf: "")
-            axis = parse_axis(text, lookup, unit_of)
-            axes.append(axis._replace(every=kind == "grid" and bool(drawn)))
-    if is_study:
-        study = loaded
-        if config.objective or config.goal:
-            study = with_objective(study, config.objective, config.goal)
-    else:
-        study = from_trial(loaded, axes, name=config.study)
-        study = with_objective(study, config.objective, config.goal)
-    return (drawn or ["grid"])[0], axes, study
-
-
-def _is_number(text: str) -> bool:
-    from snn_fusion_failure.sweeps.leaves import parse_number
-
-    try:
-        parse_number(text, "", "")
-    except ValueError:
-        return False
-    return True
-
-
-def _static(lookup: Any) -> Any:
-    def static(name: str) -> Any:
-        leaf, kind, default = lookup(name)
-        if kind == "float" and default is None:
-            return leaf, "static", None
-        return leaf, kind, default
-
-    return static
 
 
 def build(config: Config) -> Any:
     """The sweep that a command line asks for, checked, before anything is compiled."""
     from snn_fusion_failure.sweeps import engine
+    from snn_fusion_failure.sweeps.asked import DRAWN, read_axes
 
-    kind, axes, study = read_axes(config)
+    given = {name: getattr(config, name) for name in ("grid", "choice", *DRAWN)}
+    kind, axes, study = read_axes(
+        config.study, config.options, given, objective=config.objective, goal=config.goal
+    )
     if config.workers < 1:
         raise ValueError(f"workers={config.workers}: expected at least 1")
     if config.halving and config.asha:
@@ -282,21 +129,6 @@ def run(config: Config, sweep: Any) -> list[str]:
 
         show(launchers.standing(sweep))
         return engine.execute(sweep, run=missing, on_chunk=show)
-
-
-def check(config: Config) -> None:
-    """Refuse ways to run that exclude each other."""
-    from snn_fusion_failure.sweeps.engine import parse_shard
-
-    if config.distributed:
-        if config.shard or config.workers > 1 or config.launcher != "local":
-            raise ValueError("--distributed is one program; leave --shard and --workers out")
-        if config.chunk_size == "auto":
-            raise ValueError("--distributed: processes would measure apart; give --chunk-size N")
-    if config.shard:
-        parse_shard(config.shard)
-        if config.workers > 1 or config.launcher != "local":
-            raise ValueError("--shard is one process; leave --workers and --launcher out")
 
 
 def main(config: Config) -> dict[str, Any]:

@@ -6,7 +6,6 @@
 `docs/sweeps.md` has the rest.
 """
 
-from snn_fusion_failure.sweeps.api import sweep
 from snn_fusion_failure.sweeps.axes import (
     categorical,
     choice,
@@ -15,6 +14,7 @@ from snn_fusion_failure.sweeps.axes import (
     loguniform,
     uniform,
 )
+from snn_fusion_failure.sweeps.front import sweep
 from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
 __all__ = [

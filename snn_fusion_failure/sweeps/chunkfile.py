@@ -6,7 +6,6 @@ import hashlib
 import io
 import json
 import os
-import zipfile
 from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
@@ -87,7 +86,7 @@ def load_chunk(
                 leaves = sorted(k for k in held.files if k.startswith("carry_"))
                 found["carry"] = [held[k] for k in leaves]
             return found
-    except (KeyError, ValueError, zipfile.BadZipFile) as error:
+    except (KeyError, ValueError) as error:
         raise DamagedError(path, str(error)) from error
 
 

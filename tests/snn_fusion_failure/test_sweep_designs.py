@@ -191,7 +191,7 @@ def test_options_of_a_study() -> None:
 @pytest.mark.relaxed
 @pytest.mark.parametrize(
     "name", ["leaves", "axes", "designs", "study", "program", "rungs", "rank", "results", "engine",
-             "api"]
+             "front"]
 )  # fmt: skip
 def test_examples(name, capsys) -> None:
     module = importlib.import_module(f"snn_fusion_failure.sweeps.{name}")

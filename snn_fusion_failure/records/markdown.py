@@ -78,7 +78,7 @@ def cell(row: Row | None, with_unit: bool = False) -> str:
         text += f" ({row['n']})"
     if "source" in row:
         verdict = "not comparable" if row.get("not_comparable") else mark(row)
-        text += f"; source {number(row['source'], unit)}" + (f", *{verdict}*" if verdict else "")
+        text += f"<br>source {number(row['source'], unit)}" + (f", *{verdict}*" if verdict else "")
     return text
 
 

@@ -161,7 +161,7 @@ def test_page(config: render_results.Config) -> None:
     assert "Against 3 of the source's printed numbers: 1 better, 1 within, 1 worse." in page
     clean = _line(page, "| clean | **90.10**")
     low, high = intervals.share_interval([90.0, 90.2], 100.0)
-    assert f"**90.10** [{low:.2f}, {high:.2f}] (2); source 94.06, *worse*" in clean
+    assert f"**90.10** [{low:.2f}, {high:.2f}] (2)<br>source 94.06, *worse*" in clean
     assert "source 96.71, *within*" in clean
     assert clean.index("94.06") < clean.index("96.71") < clean.index("**98.00** (1)")
     assert page.index("| clean |") < page.index("| n_clean=1 uniform |")

@@ -243,9 +243,13 @@ def execute(
     def here(sweep: Sweep, on_chunk: Callable[[Progress], None]) -> Sequence[str]:
         return run_shard(sweep, on_chunk=on_chunk).errors
 
+    import jax
+
     errors: list[str] = []
     for _ in range(3):
-        errors += (run or here)(sweep, on_chunk)
+        # Processes of a distributed run look together or not at all.
+        if jax.process_count() > 1 or not rungs.is_complete(sweep):
+            errors += (run or here)(sweep, on_chunk)
         broken = damaged(sweep)
         for path in broken:
             place = os.path.relpath(set_aside(path), sweep.out)

@@ -15,7 +15,7 @@ from jaxtyping import Array, Float, Key
 from failure import bnn, revnet
 from failure.search.spaces import ReversedFeatures, Task, unit_scale
 from fusion.gating import Gate, apply_weights
-from fusion.losses import loss_targets
+from fusion.losses import LossParams, loss_targets
 from fusion.targets import TargetConfig, apply_targets, init_targets, project_targets
 
 __all__ = [
@@ -42,10 +42,9 @@ class RevArgateConfig:
         step: time step h of a block.
         feature_width: width of the path behind each feature.
         gate_width: hidden units of the gate.
-        alpha: weight of the auxiliary losses (Equation 4.6).
-        beta: weight of the fusion-weight regularisation.
-        tau: temperature of the fixed targets that anchor the learned ones.
-        anchor: weight of that anchor; 0 is the loss as printed.
+        loss: weights of the auxiliary losses (Equation 4.6), of the fusion-weight regularisation
+            and of the anchor of the learned targets (0 is the loss as printed), and the
+            temperature of the fixed targets that they are anchored to.
         steps: Adam steps on all data.
         learning_rate: of Adam, cosine decay.
         weight_decay: decoupled; 50 simulations in 60 dimensions overfit without.
@@ -56,23 +55,14 @@ class RevArgateConfig:
     step: float = 0.25
     feature_width: int = 4
     gate_width: int = 32
-    alpha: float = 1.0
-    beta: float = 1.0
-    tau: float = 0.05
-    anchor: float = 1.0
+    loss: LossParams = field(
+        default_factory=lambda: LossParams(alpha=1.0, beta=1.0, tau=0.05, anchor=1.0)
+    )
     steps: int = 600
     learning_rate: float = 3e-3
     weight_decay: float = 1e-3
     targets: TargetConfig = field(default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0)))
     restoration: bnn.BNNConfig = field(default_factory=lambda: bnn.BNNConfig(hidden=32, steps=500))
-
-    def __post_init__(self) -> None:
-        """Refuse a loss that is not one."""
-        if min(self.alpha, self.beta, self.anchor) < 0 or self.tau <= 0:
-            raise ValueError(
-                f"alpha={self.alpha}, beta={self.beta}, anchor={self.anchor}, tau={self.tau}: "
-                "expected weights of at least 0 and a positive temperature"
-            )
 
 
 class RevArgateParams(NamedTuple):
@@ -150,7 +140,7 @@ def loss(
     with squared errors, means over the rows, and :math:`f_k` falling in its own loss.
 
     Args:
-        config: :math:`\alpha, \beta, \tau` and :math:`\lambda` = `anchor`.
+        config: :math:`\alpha, \beta, \tau` and :math:`\lambda` = `anchor` in `config.loss`.
         params: all weights.
         x: inputs, unit variance.
         y: standardised outputs.
@@ -177,10 +167,11 @@ def loss(
     auxiliary = jnp.sum(mean_weights * aux_losses)
     seen = jax.lax.stop_gradient(aux_losses)[None]
     targets = apply_targets(config.targets, params.targets, seen)
-    fixed = loss_targets(seen, "softmax", config.tau)
+    fixed = loss_targets(seen, "softmax", config.loss.tau)
     pull = jnp.sum(mask * jnp.sum((weights - targets) ** 2, 1)) / count
     anchor = jnp.sum((targets - fixed) ** 2)
-    total = main + config.alpha * auxiliary + config.beta * pull + config.anchor * anchor
+    weigh = config.loss
+    total = main + weigh.alpha * auxiliary + weigh.beta * pull + weigh.anchor * anchor
     return total, main
 
 

@@ -1,50 +1,58 @@
 """Gated multi-sensor fusion that survives sensor failure (ARGate), and monotone lattices.
 
-The modules build on each other in this order: `lattice` (usable alone), `encoders`, `gating`,
-`losses`, `targets`, `models`, `failures`, `train`, `evaluate`, `data`, `fit`, `presets`, `plots`.
+Data: `load`, `Dataset`. Failures: `Protocol` and its makers, `corrupt`. Networks: `ModelConfig`,
+`init`, `predict`. Training: `preset`, `fit`, `make_train`, `test_output`. Use: `finish`,
+`FittedARGate`. The modules build on each other in this order: `lattice` (usable alone), `encoders`,
+`gating`, `losses`, `targets`, `models`, `failures`, `train`, `evaluate`, `data`, `loop`, `presets`,
+`monitor`, `fitted`; `modules` (flax), `estimator` (scikit-learn) and `plots` stand beside them.
 """
 
-from fusion import evaluate, failures, lattice, losses
+from fusion import evaluate, failures, lattice, losses  # noqa: F401
 from fusion.data import Dataset, load, validation_split
-from fusion.encoders import EncoderConfig, conv1d
-from fusion.failures import Protocol, corrupt
-from fusion.gating import normalize, oracle_weights
-from fusion.loop import Corruption, fit, test_output
-from fusion.losses import LossConfig, LossParams, argate_loss
-from fusion.models import MODELS, ModelConfig, export, init, match_parameters, predict
+from fusion.encoders import EncoderConfig
+from fusion.failures import (
+    Protocol,
+    corrupt,
+    fixed_failing,
+    generalisation,
+    no_failure,
+    random_failing,
+)
+from fusion.fitted import FittedARGate, finish
+from fusion.loop import Corruption, TrainingDiverged, fit, test_output
+from fusion.losses import LossConfig, LossParams, argate_loss, gate_penalty
+from fusion.models import MODELS, ModelConfig, export, init, predict
 from fusion.presets import preset
-from fusion.train import HyperParams, TrainConfig, init_state, make_epoch, make_train
+from fusion.train import HyperParams, TrainConfig, make_train
 
 __all__ = [
     "MODELS",
     "Corruption",
     "Dataset",
     "EncoderConfig",
+    "FittedARGate",
     "HyperParams",
     "LossConfig",
     "LossParams",
     "ModelConfig",
     "Protocol",
     "TrainConfig",
+    "TrainingDiverged",
     "argate_loss",
-    "conv1d",
     "corrupt",
-    "evaluate",
     "export",
-    "failures",
+    "finish",
     "fit",
+    "fixed_failing",
+    "gate_penalty",
+    "generalisation",
     "init",
-    "init_state",
-    "lattice",
     "load",
-    "losses",
-    "make_epoch",
     "make_train",
-    "match_parameters",
-    "normalize",
-    "oracle_weights",
+    "no_failure",
     "predict",
     "preset",
+    "random_failing",
     "test_output",
     "validation_split",
 ]

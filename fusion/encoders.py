@@ -9,13 +9,15 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from typing import Literal
+from typing import Literal, get_args
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
+
+from fusion._checks import check_choice, check_count, check_counts
 
 __all__ = [
     "EncoderConfig",
@@ -58,10 +60,17 @@ class EncoderConfig:
     def __post_init__(self) -> None:
         """Refuse sizes that cannot be built."""
         for name in ("features", "frequencies"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)}: expected at least 1")
-        if self.backend not in ("matmul", "conv"):
-            raise ValueError(f"backend={self.backend!r}: expected 'matmul' or 'conv'")
+            check_count(name, getattr(self, name))
+        for name in ("conv_features", "conv_kernels", "conv_strides"):
+            check_counts(name, getattr(self, name), size=2)
+        check_choice("spectral", self.spectral, (True, False))
+        check_choice("backend", self.backend, get_args(Backend))
+        for k, row in enumerate(self.levels):
+            if not row or not all(math.isfinite(v) for v in row) or sorted(set(row)) != list(row):
+                raise ValueError(
+                    f"levels[{k}]={row}: expected sorted, different, finite readings; make levels "
+                    "with reading_levels"
+                )
 
 
 def conv1d(
@@ -87,10 +96,15 @@ def conv1d(
     Returns:
         `[branch, batch, (time - width) // stride + 1, feature]`.
     """
+    check_choice("backend", backend, get_args(Backend))
+    check_count("stride", stride)
     k, b, t, c = x.shape
     _, w, _, f = kernel.shape
     if t < w:
-        raise ValueError(f"a series of {t} samples is shorter than the kernel of {w}")
+        raise ValueError(
+            f"x.shape={tuple(x.shape)}: expected at least {w} samples, the width of the kernel; "
+            "use longer windows or a smaller kernel"
+        )
     n = (t - w) // stride + 1
     if backend == "matmul":
         windows = [
@@ -253,7 +267,7 @@ def encoder(config: EncoderConfig, n_times: int, name: str) -> nn.Module:
         return ScalarEncoder(config, name=name)
     if n_times < shortest:
         raise ValueError(
-            f"windows of {n_times} samples are too short for the convolutions: they need "
-            f"{shortest}; use longer windows or smaller conv_kernels"
+            f"n_times={n_times}: expected at least {shortest} samples for the convolutions; use "
+            "longer windows or smaller conv_kernels"
         )
     return SeriesEncoder(config, name=name)

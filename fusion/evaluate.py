@@ -1,4 +1,4 @@
-"""Scores of a fusion model from arrays: accuracy, gate quality, robustness, comparison over seeds.
+"""Scores of a fusion model from arrays: accuracy, gate quality, robustness.
 
 Everything here runs on the host in float64, on the outputs of a model and the mask of failed
 channels; nothing needs the model itself.
@@ -6,27 +6,24 @@ channels; nothing needs the model itself.
 
 from __future__ import annotations
 
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from typing import Literal, NamedTuple, get_args
 
 import numpy as np
 from jax.typing import ArrayLike
 from jaxtyping import Bool, Float, Int, Num
-from scipy import special
+
+from fusion._checks import check_choice
 
 __all__ = [
     "AccuracySplit",
-    "Interval",
-    "PairedTest",
     "accuracy",
     "auroc",
     "confusion_matrix",
     "gap_closure",
     "gate_auroc",
-    "mean_interval",
     "mean_retained_accuracy",
     "mean_weights",
-    "paired_test",
     "retained_accuracy",
     "split_accuracy",
 ]
@@ -40,27 +37,6 @@ class AccuracySplit(NamedTuple):
     overall: float
     clean: float
     corrupted: float
-
-
-class Interval(NamedTuple):
-    """Mean of n runs with a confidence interval and the standard deviation of one run."""
-
-    mean: float
-    low: float
-    high: float
-    sd: float
-    n: int
-
-
-class PairedTest(NamedTuple):
-    """Mean difference of n paired runs, its interval, and the t test of no difference."""
-
-    difference: float
-    low: float
-    high: float
-    t: float
-    p_value: float
-    n: int
 
 
 def accuracy(labels: Int[ArrayLike, " n"], predictions: Int[ArrayLike, " n"]) -> float:
@@ -109,7 +85,8 @@ def confusion_matrix(
     for name, array in (("labels", y), ("predictions", p)):
         if array.size and (array.min() < 0 or array.max() >= n_classes):
             raise ValueError(
-                f"{name} span {array.min()}..{array.max()}, expected 0..{n_classes - 1}"
+                f"{name}=array spanning {array.min()}..{array.max()}: expected 0..{n_classes - 1}; "
+                "give the number of classes that they were made for"
             )
     counts = np.bincount(y * n_classes + p, minlength=n_classes * n_classes)
     return counts.reshape(n_classes, n_classes)
@@ -136,7 +113,9 @@ def auroc(positive: Num[ArrayLike, " p"], negative: Num[ArrayLike, " q"]) -> flo
     if not a.size or not b.size:
         return float("nan")
     if not (np.isfinite(a).all() and np.isfinite(b).all()):
-        raise ValueError("scores hold NaN or infinite values: they have no rank")
+        raise ValueError(
+            "positive, negative=array with NaN or infinity: expected finite scores; NaN has no rank"
+        )
     below = np.searchsorted(b, a, side="left").sum(dtype=np.int64)
     up_to = np.searchsorted(b, a, side="right").sum(dtype=np.int64)
     return float((below + up_to) / (2 * a.size * b.size))
@@ -167,8 +146,7 @@ def gate_auroc(
     Raises:
         ValueError: unknown `among`; non-finite weights.
     """
-    if among not in get_args(GateAmong):
-        raise ValueError(f"among is {among!r}, expected one of {list(get_args(GateAmong))}")
+    check_choice("among", among, get_args(GateAmong))
     m = np.asarray(mask)
     w = np.asarray(weights, dtype=np.float64)[m.any(axis=1)]
     m = m[m.any(axis=1)]
@@ -178,7 +156,9 @@ def gate_auroc(
         areas = [auroc(w[~m[:, k], k], w[m[:, k], k]) for k in range(m.shape[1])]
     else:
         if not np.isfinite(w).all():
-            raise ValueError("weights hold NaN or infinite values: they have no rank")
+            raise ValueError(
+                "weights=array with NaN or infinity: expected finite weights; NaN has no rank"
+            )
         wins = (w[:, :, None] > w[:, None, :]) + 0.5 * (w[:, :, None] == w[:, None, :])
         pairs = ~m[:, :, None] & m[:, None, :]
         count = pairs.sum(axis=(1, 2))
@@ -237,7 +217,7 @@ def retained_accuracy(corrupted: float, clean: float) -> float:
     Source: Beemelmanns et al. (2024), MultiCorrupt, resistance ability.
     """
     if not 0.0 < clean <= 1.0:
-        raise ValueError(f"clean accuracy is {clean}, expected a share in (0, 1]")
+        raise ValueError(f"clean={clean}: expected a share in (0, 1]; divide percent by 100")
     return corrupted / clean
 
 
@@ -256,65 +236,5 @@ def mean_retained_accuracy(corrupted: Mapping[str, float], clean: float) -> floa
         0.875
     """
     if not corrupted:
-        raise ValueError("no failure kinds given, expected at least one")
+        raise ValueError("corrupted={}: expected at least one failure kind; give their accuracies")
     return float(np.mean([retained_accuracy(v, clean) for v in corrupted.values()]))
-
-
-def _values(name: str, values: Sequence[float] | ArrayLike) -> np.ndarray:
-    array = np.asarray(values, dtype=np.float64)
-    if array.ndim != 1 or array.size < 2:
-        raise ValueError(f"{name} has shape {array.shape}, expected at least two runs in one axis")
-    if not np.isfinite(array).all():
-        raise ValueError(f"{name} holds NaN or infinite values: a run has failed")
-    return array
-
-
-def mean_interval(values: Sequence[float] | ArrayLike, *, level: float = 0.95) -> Interval:
-    r"""Mean over seeds and its confidence interval by Student's t.
-
-    .. math:: \bar x \pm t_{n-1, (1 + p) / 2}\, s / \sqrt n
-
-    Symbols: :math:`p` is `level`; :math:`s` is the standard deviation with n - 1 in the divisor.
-
-    Raises:
-        ValueError: fewer than two values, non-finite values, or `level` outside (0, 1).
-    """
-    if not 0.0 < level < 1.0:
-        raise ValueError(f"level is {level}, expected a share in (0, 1), such as 0.95")
-    x = _values("values", values)
-    sd = float(x.std(ddof=1))
-    half = float(special.stdtrit(x.size - 1, (1.0 + level) / 2.0)) * sd / x.size**0.5
-    mean = float(x.mean())
-    return Interval(mean, mean - half, mean + half, sd, x.size)
-
-
-def paired_test(
-    a: Sequence[float] | ArrayLike, b: Sequence[float] | ArrayLike, *, level: float = 0.95
-) -> PairedTest:
-    r"""Compare two models run by run (same seed, same corruption, same split).
-
-    .. math:: d_i = a_i - b_i, \qquad t = \frac{\bar d}{s_d / \sqrt n}
-
-    Args:
-        a, b: a score of each model in each run, in the same order.
-        level: of the interval of the mean difference.
-
-    Returns:
-        PairedTest with the two-sided p value. When all differences are equal, t is infinite and p
-        is 0, or t is 0 and p is 1 if they are all zero.
-
-    Raises:
-        ValueError: different lengths, fewer than two runs, or non-finite values.
-
-    Source: Student (1908).
-    """
-    x, y = _values("a", a), _values("b", b)
-    if x.size != y.size:
-        raise ValueError(f"{x.size} runs against {y.size}: a paired test needs the same runs")
-    d = mean_interval(x - y, level=level)
-    if d.sd > 0.0:
-        t = d.mean / (d.sd / d.n**0.5)
-    else:
-        t = float(np.copysign(np.inf, d.mean)) if d.mean else 0.0
-    p = 2.0 * float(special.stdtr(d.n - 1, -abs(t)))
-    return PairedTest(d.mean, d.low, d.high, t, p, d.n)

@@ -14,7 +14,9 @@ from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, PRNGKeyArray
+from jaxtyping import Array, Bool, Float, Key
+
+from fusion._checks import check_choice, check_count, check_key, check_number
 
 __all__ = [
     "FAILURE_KINDS",
@@ -60,34 +62,43 @@ class Protocol:
     def __post_init__(self) -> None:
         """Check every field before anything is compiled."""
         k = self.n_channels
-        if k < 1:
-            raise ValueError(f"n_channels is {k}, expected at least 1")
-        if not 0 <= self.low <= self.high <= k:
+        check_count("n_channels", k)
+        check_count("low", self.low, 0, k)
+        check_count("high", self.high, self.low, k)
+        check_number("clean_fraction", self.clean_fraction, 0.0, 1.0, fix="1/3 in the source")
+        for index, channel in enumerate(self.failing):
+            check_count(f"failing[{index}]", channel, 0, k - 1)
+        if len(set(self.failing)) != len(self.failing):
             raise ValueError(
-                f"failing channels from {self.low} to {self.high}: expected "
-                f"0 <= low <= high <= {k}, the number of channels"
+                f"failing={self.failing}: expected different channels; leave the repeated ones out"
             )
-        if not 0.0 <= self.clean_fraction <= 1.0:
+        if self.failing and not self.low == self.high == len(self.failing):
             raise ValueError(
-                f"clean_fraction is {self.clean_fraction}, expected a share in [0, 1] (1/3 in the "
-                "source)"
+                f"failing={self.failing}: expected low = high = {len(self.failing)}, not "
+                f"{self.low} and {self.high}; use fixed_failing(...)"
             )
-        if self.failing:
-            wrong = [i for i in self.failing if not 0 <= i < k]
-            if wrong or len(set(self.failing)) != len(self.failing):
-                raise ValueError(
-                    f"failing is {self.failing}: expected different indices in 0..{k - 1}"
-                )
-            if not self.low == self.high == len(self.failing):
-                raise ValueError(
-                    f"{len(self.failing)} fixed failing channels but low={self.low} and "
-                    f"high={self.high}: use fixed_failing(...)"
-                )
 
 
 def no_failure(channels: Sequence[str]) -> Protocol:
-    """All channels of all examples stay clean."""
-    return Protocol(len(channels), 0, 0, clean_fraction=1.0)
+    """All channels of all examples stay clean.
+
+    Example:
+        >>> no_failure(("a", "b")).high
+        0
+    """
+    return Protocol(len(_channels(channels)), 0, 0, clean_fraction=1.0)
+
+
+def _channels(channels: Sequence[str]) -> list[str]:
+    """The names, or ValueError when one occurs twice or there is none."""
+    names = list(channels)
+    twice = sorted({name for name in names if names.count(name) > 1})
+    if twice or not names:
+        raise ValueError(
+            f"channels={names}: expected one or more different names; "
+            + (f"rename {', '.join(map(repr, twice))}" if twice else "give at least one")
+        )
+    return names
 
 
 def fixed_failing(
@@ -104,13 +115,13 @@ def fixed_failing(
         >>> fixed_failing(("a", "b", "c"), ("c", "a")).failing
         (0, 2)
     """
-    unknown = [name for name in failing if name not in channels]
-    if unknown or not failing:
-        raise ValueError(
-            f"failing channels {unknown or list(failing)}: expected one or more of {list(channels)}"
-        )
-    index = tuple(sorted(list(channels).index(name) for name in failing))
-    return Protocol(len(channels), len(index), len(index), index, clean_fraction)
+    names = _channels(channels)
+    for name in failing:
+        check_choice("failing", name, names)
+    if not failing:
+        raise ValueError(f"failing={failing!r}: expected one or more of {names}; name them")
+    index = tuple(sorted(names.index(name) for name in failing))
+    return Protocol(len(names), len(index), len(index), index, clean_fraction)
 
 
 def random_failing(
@@ -119,7 +130,7 @@ def random_failing(
     """Each corrupted example keeps `n_clean` channels, drawn for this example.
 
     Raises:
-        ValueError: `n_clean` outside 0..K-1.
+        TypeError, ValueError: `n_clean` is not a whole number in 0..K-1.
 
     Source: Shim (2020), section 3.3.3.2, random failing sensor assignment.
 
@@ -127,12 +138,13 @@ def random_failing(
         >>> random_failing(("a", "b", "c"), n_clean=1).low
         2
     """
-    k = len(channels)
-    if not 0 <= n_clean < k:
+    k = len(_channels(channels))
+    if n_clean == k:
         raise ValueError(
-            f"n_clean is {n_clean}, expected 0..{k - 1} for {k} channels "
-            "(no_failure(...) keeps all clean)"
+            f"n_clean={n_clean}: expected a whole number 0..{k - 1} for {k} channels; "
+            "no_failure(...) keeps all clean"
         )
+    check_count("n_clean", n_clean, 0, k - 1)
     return Protocol(k, k - n_clean, k - n_clean, clean_fraction=clean_fraction)
 
 
@@ -153,19 +165,17 @@ def generalisation(
 
     Source: Shim (2020), section 3.3.3.2 and Tables 3.3 and 3.6, failing sensor generation test.
     """
-    k = len(channels)
+    k = len(_channels(channels))
     for part, (low, high) in (("train", train), ("test", test)):
-        if not 1 <= low <= high <= k:
-            raise ValueError(
-                f"{part} range ({low}, {high}): expected 1 <= low <= high <= {k} failing channels"
-            )
+        check_count(f"{part}[0]", low, 1, k)
+        check_count(f"{part}[1]", high, low, k)
     return (
         Protocol(k, *train, clean_fraction=clean_fraction),
         Protocol(k, *test, clean_fraction=clean_fraction),
     )
 
 
-def draw_mask(key: PRNGKeyArray, n: int, protocol: Protocol) -> Bool[Array, "n k"]:
+def draw_mask(protocol: Protocol, n: int, *, key: Key[Array, ""]) -> Bool[Array, "n k"]:
     """Draw which channels of which of n examples fail.
 
     Exactly `round(clean_fraction * n)` examples, at random places, keep all channels. In each other
@@ -175,6 +185,7 @@ def draw_mask(key: PRNGKeyArray, n: int, protocol: Protocol) -> Bool[Array, "n k
     Returns:
         `[n, K]`, True where a channel has failed.
     """
+    check_key(key)
     k = protocol.n_channels
     row_key, count_key, channel_key = jax.random.split(key, 3)
     n_clean_rows = round(protocol.clean_fraction * n)
@@ -194,28 +205,28 @@ def draw_mask(key: PRNGKeyArray, n: int, protocol: Protocol) -> Bool[Array, "n k
 
 
 def _uniform_in(
-    key: PRNGKeyArray, shape: tuple[int, ...], bounds: tuple[float, float], dtype: jnp.dtype
+    key: Key[Array, ""], shape: tuple[int, ...], bounds: tuple[float, float], dtype: jnp.dtype
 ) -> Array:
     return jax.random.uniform(key, shape, dtype, bounds[0], bounds[1])
 
 
-def _random_sign(key: PRNGKeyArray, shape: tuple[int, ...], dtype: jnp.dtype) -> Array:
+def _random_sign(key: Key[Array, ""], shape: tuple[int, ...], dtype: jnp.dtype) -> Array:
     return jax.random.rademacher(key, shape, dtype)
 
 
-def _uniform_noise(key: PRNGKeyArray, x: Array) -> Array:
+def _uniform_noise(key: Key[Array, ""], x: Array) -> Array:
     return jax.random.uniform(key, x.shape, x.dtype, -1.0, 1.0)
 
 
-def _gaussian_noise(key: PRNGKeyArray, x: Array) -> Array:
+def _gaussian_noise(key: Key[Array, ""], x: Array) -> Array:
     return jax.random.normal(key, x.shape, x.dtype)
 
 
-def _zero(key: PRNGKeyArray, x: Array) -> Array:
+def _zero(key: Key[Array, ""], x: Array) -> Array:
     return jnp.zeros_like(x)
 
 
-def _stuck(key: PRNGKeyArray, x: Array) -> Array:
+def _stuck(key: Key[Array, ""], x: Array) -> Array:
     n, k, t = x.shape
     if t == 1:
         # A row has no past of its own: the sensor repeats what it read in another row.
@@ -227,7 +238,7 @@ def _stuck(key: PRNGKeyArray, x: Array) -> Array:
     return jnp.take_along_axis(x, time, axis=2)
 
 
-def _drift(key: PRNGKeyArray, x: Array) -> Array:
+def _drift(key: Key[Array, ""], x: Array) -> Array:
     n, k, t = x.shape
     size_key, sign_key, onset_key = jax.random.split(key, 3)
     slope = _uniform_in(size_key, (n, k, 1), DRIFT_RANGE, x.dtype)
@@ -237,7 +248,7 @@ def _drift(key: PRNGKeyArray, x: Array) -> Array:
     return x + slope * jnp.maximum(time[None, None, :] - onset, 0.0)
 
 
-def _dropout(key: PRNGKeyArray, x: Array) -> Array:
+def _dropout(key: Key[Array, ""], x: Array) -> Array:
     n, k, t = x.shape
     start_key, length_key = jax.random.split(key)
     start = jax.random.uniform(start_key, (n, k, 1, BURSTS), x.dtype)
@@ -248,20 +259,20 @@ def _dropout(key: PRNGKeyArray, x: Array) -> Array:
     return jnp.where(lost, jnp.zeros_like(x), x)
 
 
-def _gain(key: PRNGKeyArray, x: Array) -> Array:
+def _gain(key: Key[Array, ""], x: Array) -> Array:
     n, k, _ = x.shape
     size_key, sign_key = jax.random.split(key)
     size = jnp.log(_uniform_in(size_key, (n, k, 1), GAIN_RANGE, x.dtype))
     return x * jnp.exp(size * _random_sign(sign_key, (n, k, 1), x.dtype))
 
 
-def _clip(key: PRNGKeyArray, x: Array) -> Array:
+def _clip(key: Key[Array, ""], x: Array) -> Array:
     n, k, _ = x.shape
     rail = _uniform_in(key, (n, k, 1), CLIP_RANGE, x.dtype)
     return jnp.clip(x, -rail, rail)
 
 
-_FAILED: dict[str, Callable[[PRNGKeyArray, Array], Array]] = {
+_FAILED: dict[str, Callable[[Key[Array, ""], Array], Array]] = {
     "uniform": _uniform_noise,
     "gaussian": _gaussian_noise,
     "zero": _zero,
@@ -274,11 +285,11 @@ _FAILED: dict[str, Callable[[PRNGKeyArray, Array], Array]] = {
 
 
 def apply_failure(
-    key: PRNGKeyArray,
     x: Float[Array, "n k t"],
     mask: Bool[Array, "n k"],
-    kind: str,
+    kind: FailureKind | str,
     *,
+    key: Key[Array, ""],
     severity: float | Float[Array, ""] = 1.0,
 ) -> Float[Array, "n k t"]:
     r"""Replace the readings of failed channels.
@@ -298,24 +309,25 @@ def apply_failure(
     - `clip`: saturated at a rail between 0 and 0.2.
 
     Args:
-        key: typed PRNG key; only the values depend on it, not the mask.
         x: windows scaled to [-1, 1].
         mask: True where a channel has failed, from `draw_mask`.
         kind: one of `FAILURE_KINDS` (static).
+        key: typed PRNG key; only the values depend on it, not the mask.
         severity: share of the way from the clean to the failed reading.
 
     Returns:
         `[N, K, T]`; clean channels are returned bit for bit.
 
     Raises:
-        ValueError: unknown kind; the message lists the known ones.
+        ValueError: unknown kind, a severity outside [0, 1], a legacy key.
 
     Source: Shim (2020), section 3.3.3.1, for uniform and gaussian. Gaussian noise is not clipped,
     so a third of its samples lie outside [-1, 1], as the source's definition has it. The other
     kinds are ours, for robustness scores.
     """
-    if kind not in _FAILED:
-        raise ValueError(f"failure kind {kind!r} is unknown, expected one of {list(FAILURE_KINDS)}")
+    check_choice("kind", kind, FAILURE_KINDS)
+    check_number("severity", severity, 0.0, 1.0, fix="it is a share; 1 is a whole failure")
+    check_key(key)
     failed = _FAILED[kind](key, x)
     if not (isinstance(severity, float) and severity == 1.0):
         failed = x + jnp.asarray(severity, x.dtype) * (failed - x)
@@ -323,20 +335,20 @@ def apply_failure(
 
 
 def corrupt(
-    key: PRNGKeyArray,
-    x: Float[Array, "n k t"],
     protocol: Protocol,
-    kind: str,
+    x: Float[Array, "n k t"],
+    kind: FailureKind | str = "uniform",
     *,
+    key: Key[Array, ""],
     severity: float | Float[Array, ""] = 1.0,
 ) -> tuple[Float[Array, "n k t"], Bool[Array, "n k"]]:
     """Draw the failing channels of every example and replace their readings.
 
     Args:
-        key: one key gives one corruption; the mask is the same for all kinds and severities.
-        x: windows scaled to [-1, 1].
         protocol: which channels fail (static).
+        x: windows scaled to [-1, 1].
         kind: how they fail (static), see `apply_failure`.
+        key: one key gives one corruption; the mask is the same for all kinds and severities.
         severity: see `apply_failure`.
 
     Returns:
@@ -347,15 +359,18 @@ def corrupt(
 
     Example:
         >>> x = jnp.full((6, 4, 1), 0.5)
-        >>> y, mask = corrupt(jax.random.key(0), x, random_failing("abcd", n_clean=1), "zero")
+        >>> y, mask = corrupt(random_failing("abcd", n_clean=1), x, "zero", key=jax.random.key(0))
         >>> int(mask.any(axis=1).sum()), int(mask.sum()), float(y.sum())
         (4, 12, 6.0)
     """
-    if x.shape[1] != protocol.n_channels:
+    check_key(key)
+    check_choice("kind", kind, FAILURE_KINDS)
+    if x.ndim != 3 or x.shape[1] != protocol.n_channels:
         raise ValueError(
-            f"x has {x.shape[1]} channels, the protocol is for {protocol.n_channels}: build it "
-            "from the channels of this data set"
+            f"x.shape={tuple(x.shape)}: expected [N, {protocol.n_channels}, T], the protocol's "
+            "channels; build the protocol from the channels of this data set"
         )
+    check_number("severity", severity, 0.0, 1.0, fix="it is a share; 1 is a whole failure")
     mask_key, value_key = jax.random.split(key)
-    mask = draw_mask(mask_key, x.shape[0], protocol)
-    return apply_failure(value_key, x, mask, kind, severity=severity), mask
+    mask = draw_mask(protocol, x.shape[0], key=mask_key)
+    return apply_failure(x, mask, kind, key=value_key, severity=severity), mask

@@ -6,17 +6,22 @@ weights (`[batch, branch]`), as a user reads them: one row of weights per exampl
 
 from __future__ import annotations
 
-from typing import Literal
+from typing import Literal, get_args
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Key
+
+from fusion._checks import check_choice, check_key, check_number
 
 __all__ = [
+    "Fusion",
     "Gate",
     "Normalizer",
+    "Scaling",
     "apply_weights",
+    "available_weights",
     "drop_modalities",
     "embrace",
     "normalize",
@@ -24,6 +29,8 @@ __all__ = [
 ]
 
 Normalizer = Literal["softmax", "softmax_sigmoid"]
+Fusion = Literal["concat", "sum"]
+Scaling = Literal["mean", "max"]
 
 
 def normalize(scores: Float[Array, "*b k"], normalizer: Normalizer | str) -> Float[Array, "*b k"]:
@@ -45,10 +52,9 @@ def normalize(scores: Float[Array, "*b k"], normalizer: Normalizer | str) -> Flo
 
     Source: Shim (2020), section 3.2.1 and Eq. 3.1.
     """
+    check_choice("normalizer", normalizer, get_args(Normalizer))
     if normalizer == "softmax_sigmoid":
         scores = jax.nn.sigmoid(scores)
-    elif normalizer != "softmax":
-        raise ValueError(f"normalizer={normalizer!r}: expected 'softmax' or 'softmax_sigmoid'")
     return jax.nn.softmax(scores, axis=-1)
 
 
@@ -85,8 +91,41 @@ def oracle_weights(failed: Bool[Array, "b k"]) -> Float[Array, "b k"]:
     return healthy / jnp.maximum(1.0, jnp.sum(healthy, axis=-1, keepdims=True))
 
 
+def available_weights(
+    weights: Float[Array, "b k"], available: Bool[Array, "b k"]
+) -> Float[Array, "b k"]:
+    r"""Fusion weights of the sensors that are there, with the sum that all had.
+
+    .. math:: w'_k = a_k w_k / \textstyle\sum_j a_j w_j
+
+    Args:
+        weights: of all sensors; rows sum to one.
+        available: False where a sensor sent nothing.
+
+    Returns:
+        Weights with the shape of `weights`: to the bit the same where all sensors are there, zero
+        for absent ones, and zero for all where none is there.
+
+    Example:
+        >>> weights, there = jnp.array([[0.5, 0.25, 0.25]]), jnp.array([[False, True, True]])
+        >>> available_weights(weights, there).tolist()
+        [[0.0, 0.5, 0.5]]
+    """
+    kept = jnp.where(available, weights, jnp.zeros_like(weights))
+    total = jnp.sum(kept, axis=-1, keepdims=True)
+    # Where a gate gives all weight to what is absent, the sensors that are there share it.
+    count = jnp.sum(available, axis=-1, keepdims=True).astype(weights.dtype)
+    even = available.astype(weights.dtype) / jnp.maximum(count, jnp.ones_like(count))
+    tiny = jnp.finfo(weights.dtype).tiny
+    shared = jnp.where(total > tiny, kept / jnp.maximum(total, tiny), even)
+    return jnp.where(jnp.all(available, axis=-1, keepdims=True), weights, shared)
+
+
 def apply_weights(
-    features: Float[Array, "k b f"], weights: Float[Array, "b k"], fusion: str, scale: str
+    features: Float[Array, "k b f"],
+    weights: Float[Array, "b k"],
+    fusion: Fusion | str = "concat",
+    scale: Scaling | str = "mean",
 ) -> Float[Array, "b g"]:
     r"""Weight the features and join them.
 
@@ -99,23 +138,18 @@ def apply_weights(
     instead: healthy sensors then pass unchanged however many have failed, but a gate without
     auxiliary paths trains badly (it can shut informative sensors off early).
     """
+    check_choice("fusion", fusion, get_args(Fusion))
+    check_choice("scale", scale, get_args(Scaling))
     k, b, _ = features.shape
-    if scale == "max":
-        gain = weights / jnp.max(weights, axis=-1, keepdims=True)
-    elif scale == "mean":
-        gain = k * weights
-    else:
-        raise ValueError(f"scale={scale!r}: expected 'mean' or 'max'")
+    gain = weights / jnp.max(weights, axis=-1, keepdims=True) if scale == "max" else k * weights
     gated = features * gain.T[:, :, None]
     if fusion == "concat":
         return jnp.transpose(gated, (1, 0, 2)).reshape(b, -1)
-    if fusion == "sum":
-        return jnp.mean(gated, axis=0)
-    raise ValueError(f"fusion={fusion!r}: expected 'concat' or 'sum'")
+    return jnp.mean(gated, axis=0)
 
 
 def drop_modalities(
-    key: Array, features: Float[Array, "k b f"], rate: float
+    features: Float[Array, "k b f"], rate: float, *, key: Key[Array, ""]
 ) -> Float[Array, "k b f"]:
     """Modality dropout: each sensor's features are zeroed with probability `rate`, never all.
 
@@ -123,6 +157,8 @@ def drop_modalities(
 
     Source: Neverova et al. (2016), ModDrop; Ku et al. (2018), path drop.
     """
+    check_number("rate", rate, 0.0, 1.0, fix="it is the probability to drop a sensor")
+    check_key(key)
     k, b, _ = features.shape
     draw_key, spare_key = jax.random.split(key)
     keep = jax.random.uniform(draw_key, (k, b)) >= rate
@@ -134,7 +170,10 @@ def drop_modalities(
 
 
 def embrace(
-    features: Float[Array, "k b f"], key: Array | None, keep: Float[Array, "b k"] | None = None
+    features: Float[Array, "k b f"],
+    keep: Float[Array, "b k"] | None = None,
+    *,
+    key: Key[Array, ""] | None = None,
 ) -> Float[Array, "b f"]:
     r"""EmbraceNet fusion: each feature is taken from one sensor, drawn at random.
 
@@ -145,8 +184,8 @@ def embrace(
 
     Args:
         features: docked features of the K sensors.
-        key: PRNG key of the draws, or None for the expectation.
         keep: availability of each sensor, `[batch, branch]`; all available when None.
+        key: PRNG key of the draws, or None for the expectation.
 
     Source: Choi and Lee (2019), EmbraceNet. Deviation: the expectation at inference.
     """

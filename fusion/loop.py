@@ -15,12 +15,21 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array
+from jaxtyping import Array, Key
 
+from fusion._checkpoints import Checkpoints, settings_of
+from fusion._checks import check_choice, check_count, check_key, check_number, check_type
 from fusion.data.dataset import Dataset
-from fusion.failures import FailureKind, Protocol, corrupt
+from fusion.failures import FAILURE_KINDS, FailureKind, Protocol, corrupt
 from fusion.models import ModelConfig, export
-from fusion.train import HyperParams, TrainConfig, TrainState, evaluate, init_state, make_epoch
+from fusion.train import (
+    HyperParams,
+    TrainConfig,
+    TrainState,
+    init_state,
+    make_epoch,
+    predict_batches,
+)
 
 __all__ = ["Corruption", "FitResult", "TestOutput", "TrainingDiverged", "fit", "test_output"]
 
@@ -38,9 +47,22 @@ class Corruption:
 
     train: Protocol
     test: Protocol
-    kind: FailureKind = "uniform"
-    test_kind: FailureKind | None = None
+    kind: FailureKind | str = "uniform"
+    test_kind: FailureKind | str | None = None
     redraw: bool = True
+
+    def __post_init__(self) -> None:
+        """Refuse what is no protocol and no kind of failure."""
+        for name in ("train", "test"):
+            check_type(name, getattr(self, name), Protocol, "make it with fusion.random_failing")
+        if self.train.n_channels != self.test.n_channels:
+            raise ValueError(
+                f"test.n_channels={self.test.n_channels}: expected {self.train.n_channels} as in "
+                "training; build both protocols from the channels of one data set"
+            )
+        check_choice("kind", self.kind, FAILURE_KINDS)
+        check_choice("test_kind", self.test_kind, (None, *FAILURE_KINDS))
+        check_choice("redraw", self.redraw, (True, False))
 
 
 class FitResult(NamedTuple):
@@ -71,10 +93,10 @@ def _epoch(model: ModelConfig, config: TrainConfig, n: int) -> Callable[..., Any
 
 @functools.lru_cache(maxsize=32)
 def _evaluate(model: ModelConfig) -> Callable[..., Any]:
-    return jax.jit(lambda main, x, failed: evaluate(main, model, x, failed))
+    return jax.jit(lambda main, x, failed: predict_batches(model, main, x, failed))
 
 
-_corrupt = jax.jit(corrupt, static_argnums=(2, 3))
+_corrupt = jax.jit(corrupt, static_argnums=(0, 2))
 
 
 def _floats(metrics: Any) -> dict[str, float]:
@@ -85,63 +107,31 @@ def _floats(metrics: Any) -> dict[str, float]:
     }
 
 
-class _Checkpoints:
-    """Orbax checkpoints of (state, history); loading orbax is left until one is wanted."""
-
-    def __init__(self, folder: Path) -> None:
-        import orbax.checkpoint as ocp
-
-        self._ocp = ocp
-        options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False)
-        self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
-
-    def save(self, epoch: int, state: TrainState, history: list[dict[str, float]]) -> None:
-        if epoch == 0 or epoch in self._manager.all_steps():
-            return
-        args = self._ocp.args
-        self._manager.save(
-            epoch,
-            args=args.Composite(state=args.StandardSave(state), history=args.JsonSave(history)),
-        )
-
-    def restore(self, like: TrainState) -> tuple[int, TrainState, list[dict[str, float]]] | None:
-        epoch = self._manager.latest_step()
-        if epoch is None:
-            return None
-        args = self._ocp.args
-        held = self._manager.restore(
-            epoch,
-            args=args.Composite(state=args.StandardRestore(like), history=args.JsonRestore()),
-        )
-        return epoch, held["state"], list(held["history"])
-
-    def close(self) -> None:
-        self._manager.close()
-
-
 def fit(
-    key: Array,
-    dataset: Dataset,
     model: ModelConfig,
-    config: TrainConfig,
+    train: TrainConfig,
     hyper: HyperParams,
-    corruption: Corruption,
+    data: Dataset,
+    noise: Corruption,
     *,
+    key: Key[Array, ""],
     checkpoint_dir: Path | None = None,
     checkpoint_every: int = 10,
+    checkpoint_minutes: float = 2.0,
     resume: bool = False,
     on_epoch: Callable[[int, dict[str, float]], None] | None = None,
 ) -> FitResult:
-    """Train one network on the training rows of `dataset`.
+    """Train one network on the training rows of `data`.
 
     Args:
+        model, train, hyper: the network and how it is trained.
+        data: windows in [-1, 1] and labels.
+        noise: which channels fail.
         key: decides everything random; equal keys give equal corruption for all models.
-        dataset: windows in [-1, 1] and labels.
-        model, config, hyper: the network and how it is trained.
-        corruption: which channels fail.
         checkpoint_dir: where to keep checkpoints; none are kept without it.
         checkpoint_every: epochs between checkpoints; the last epoch and an interrupt save too.
-        resume: go on from the newest checkpoint in `checkpoint_dir`.
+        checkpoint_minutes: time after which an epoch saves whatever its number.
+        resume: go on from the newest checkpoint in `checkpoint_dir`, with the same settings.
         on_epoch: called with (epochs done, metrics) after every epoch.
 
     Returns:
@@ -149,34 +139,41 @@ def fit(
 
     Raises:
         TrainingDiverged: the loss is not finite; the last finite state has been saved.
-        ValueError: model and dataset disagree in shape, or checkpoints are there and `resume` is
-            not set.
+        ValueError: model and data set disagree in shape; checkpoints are there and `resume` is
+            not set; `resume` is set and the checkpoints have other settings, data or key.
     """
-    _check(dataset, model)
+    _check(model, data, noise)
+    check_key(key)
+    check_count("checkpoint_every", checkpoint_every)
+    check_number("checkpoint_minutes", checkpoint_minutes, 0.0, fix="0 saves every epoch")
     init_key, epoch_key, noise_key = (jax.random.fold_in(key, i) for i in range(3))
-    state = init_state(init_key, model, config)
+    state = init_state(init_key, model, train)
     history: list[dict[str, float]] = []
-    checkpoints = None if checkpoint_dir is None else _Checkpoints(checkpoint_dir)
-    start = 0
-    if checkpoints is not None and (held := checkpoints.restore(state)) is not None:
-        if not resume:
-            raise ValueError(
-                f"{checkpoint_dir} holds checkpoints of another run; resume it, or choose an empty "
-                "folder"
-            )
-        start, state, history = held
-    x, y = jnp.asarray(dataset.train_x), jnp.asarray(dataset.train_y)
+    start, checkpoints = 0, None
+    if checkpoint_dir is not None:
+        settings = settings_of(
+            model=model,
+            train=train,
+            hyper=hyper,
+            noise=noise,
+            key=np.asarray(jax.random.key_data(key)),
+            train_x=data.train_x,
+            train_y=data.train_y,
+        )
+        checkpoints = Checkpoints(Path(checkpoint_dir), settings, checkpoint_minutes)
+        if (held := checkpoints.restore(state, resume=resume)) is not None:
+            start, state, history = held
+    x, y = jnp.asarray(data.train_x), jnp.asarray(data.train_y)
     hyper = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hyper)
-    step = _epoch(model, config, len(x))
+    step = _epoch(model, train, len(x))
     done = start
     try:
-        for epoch in range(start, config.epochs):
-            draw = jax.random.fold_in(noise_key, epoch if corruption.redraw else 0)
-            if epoch == start or corruption.redraw:
-                noisy, failed = _corrupt(draw, x, corruption.train, corruption.kind)
-            new_state, metrics = step(
-                state, hyper, jax.random.fold_in(epoch_key, epoch), noisy, y, failed
-            )
+        for epoch in range(start, train.epochs):
+            draw = jax.random.fold_in(noise_key, epoch if noise.redraw else 0)
+            if epoch == start or noise.redraw:
+                noisy, failed = _corrupt(noise.train, x, noise.kind, key=draw)
+            step_key = jax.random.fold_in(epoch_key, epoch)
+            new_state, metrics = step(hyper, state, noisy, y, failed, key=step_key)
             row = _floats(metrics)
             if not np.isfinite(row["total"]):
                 raise TrainingDiverged(
@@ -188,7 +185,8 @@ def fit(
             history.append(row)
             if on_epoch is not None:
                 on_epoch(done, row)
-            if checkpoints is not None and done % checkpoint_every == 0:
+            due = checkpoints is not None and checkpoints.is_due()
+            if checkpoints is not None and (done % checkpoint_every == 0 or due):
                 checkpoints.save(done, state, history)
     finally:
         # Reached on success, Ctrl-C and divergence alike: what was computed is kept.
@@ -199,43 +197,54 @@ def fit(
 
 
 def test_output(
-    key: Array,
-    state: TrainState,
-    dataset: Dataset,
     model: ModelConfig,
-    corruption: Corruption,
+    state: TrainState,
+    data: Dataset,
+    noise: Corruption,
     *,
-    kind: FailureKind | None = None,
+    key: Key[Array, ""],
+    kind: FailureKind | str | None = None,
 ) -> TestOutput:
     """Run the exported main model on the corrupted test rows `[N, K, T]`.
 
     Args:
+        model: as in `fit`.
+        state: trained.
+        data, noise: as in `fit`.
         key: the run's key; the test corruption depends on it and on nothing else, so that all
             models of a seed are compared on the same examples.
-        state: trained.
-        dataset, model, corruption: as in `fit`.
-        kind: another failure kind than `corruption.test_kind` (for robustness scores).
+        kind: another failure kind than `noise.test_kind` (for robustness scores).
 
     Returns:
         Logits, fusion weights, mask of failed sensors and labels, in the order of the test rows.
     """
-    _check(dataset, model)
-    kind = kind or corruption.test_kind or corruption.kind
+    _check(model, data, noise)
+    check_key(key)
+    check_choice("kind", kind, (None, *FAILURE_KINDS))
+    kind = kind or noise.test_kind or noise.kind
     test_key = jax.random.fold_in(key, 3)
-    x, failed = _corrupt(test_key, jnp.asarray(dataset.test_x), corruption.test, kind)
+    x, failed = _corrupt(noise.test, jnp.asarray(data.test_x), kind, key=test_key)
     logits, weights = _evaluate(model)(export(state.params), x, failed)
-    return TestOutput(np.asarray(logits), np.asarray(weights), np.asarray(failed), dataset.test_y)
+    return TestOutput(np.asarray(logits), np.asarray(weights), np.asarray(failed), data.test_y)
 
 
 test_output.__test__ = False  # type: ignore[attr-defined]  # not a pytest function
 TestOutput.__test__ = False  # type: ignore[attr-defined]
 
 
-def _check(dataset: Dataset, model: ModelConfig) -> None:
-    shape = (dataset.n_channels, dataset.n_time, dataset.n_classes)
-    wanted = (model.n_sensors, model.n_times, model.n_classes)
-    if shape != wanted:
+def _check(model: ModelConfig, data: Dataset, noise: Corruption) -> None:
+    for name, given, found in (
+        ("n_sensors", model.n_sensors, data.n_channels),
+        ("n_times", model.n_times, data.n_time),
+        ("n_classes", model.n_classes, data.n_classes),
+    ):
+        if given != found:
+            raise ValueError(
+                f"model.{name}={given}: expected {found} for the data set {data.name!r}; build "
+                "the ModelConfig from the data set"
+            )
+    if noise.train.n_channels != data.n_channels:
         raise ValueError(
-            f"the data set {dataset.name!r} has (sensors, samples, classes) = {shape}, the model "
-            f"is for {wanted}; build the ModelConfig from the data set"
+            f"noise.train.n_channels={noise.train.n_channels}: expected {data.n_channels} for the "
+            f"data set {data.name!r}; build the protocols from its channels"
         )

@@ -3,31 +3,70 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from collections.abc import Iterable
+from typing import Any, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
+from fusion._checks import check_choice, check_number
 from fusion.gating import Normalizer, normalize
 
-__all__ = ["LossConfig", "LossParams", "LossTerms", "argate_loss", "cross_entropy", "loss_targets"]
+__all__ = [
+    "GatePenalty",
+    "LossConfig",
+    "LossParams",
+    "LossTerms",
+    "argate_loss",
+    "cross_entropy",
+    "gate_penalty",
+    "loss_targets",
+]
 
 
-class LossParams(NamedTuple):
-    """What a sweep may vary; leaves are scalars, so `jax.vmap` runs over them.
-
-    Attributes:
-        alpha: weight of the auxiliary losses (Equation 3.1).
-        beta: weight of the fusion-weight regularization (Equation 3.1).
-        tau: temperature of the target `softmax(-loss / tau)`; unused by the printed target.
-        anchor: weight that pulls learned targets to `softmax(-loss / tau)`; 0 as printed.
-    """
-
+class _LossParams(NamedTuple):
     alpha: float | Array = 1.0
     beta: float | Array = 1.0
     tau: float | Array = 1.0
     anchor: float | Array = 0.0
+
+
+class LossParams(_LossParams):
+    """What a sweep may vary; leaves are scalars, so `jax.vmap` runs over them.
+
+    Attributes:
+        alpha: weight of the auxiliary losses (Equation 3.1), >= 0.
+        beta: weight of the fusion-weight regularization (Equation 3.1), >= 0.
+        tau: temperature of the target `softmax(-loss / tau)`, > 0; unused by the printed target.
+        anchor: weight that pulls learned targets to `softmax(-loss / tau)`, >= 0; 0 as printed.
+
+    Raises:
+        ValueError: a number out of its range. Arrays and traced values are not looked at.
+
+    Example:
+        >>> LossParams(alpha=0.5)
+        LossParams(alpha=0.5, beta=1.0, tau=1.0, anchor=0.0)
+    """
+
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        alpha: Any = 1.0,
+        beta: Any = 1.0,
+        tau: Any = 1.0,
+        anchor: Any = 0.0,
+    ) -> LossParams:
+        """Check the numbers that are given as numbers."""
+        for name, value in (("alpha", alpha), ("beta", beta), ("anchor", anchor)):
+            check_number(name, value, 0.0, fix="0 leaves the term out")
+        check_number("tau", tau, 0.0, above=True, fix="small temperatures give sharp targets")
+        return super().__new__(cls, alpha, beta, tau, anchor)
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Any]) -> LossParams:
+        return cls(*iterable)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -39,35 +78,60 @@ class LossConfig:
         loss_weighting: auxiliary losses are weighted by the fusion weights (ALW); else the mean.
         regularization: fusion weights are pulled to targets (FWR).
         learned_targets: the targets come from the monotone lattice (Equation 3.2).
-        normalizer: of the weights; the fixed targets follow it (see `loss_targets`).
+        fixed_targets: form of the targets that are made of the losses, see `loss_targets`.
         stop_targets: no gradient from the regularization into the auxiliary losses; without it
             the auxiliary heads can be made worse to please the gate.
         stop_weights: no gradient of the alpha term into the fusion weights; with it the term trains
             the auxiliary paths only, and does not pull w to whichever path fits first.
         uniform_floor: share of equal weighting mixed into the alpha term's weights, in [0, 1], so
             that the path of a sensor with a low weight goes on learning.
-        label_smoothing: share of the label mass spread over all classes, main and auxiliary.
+        label_smoothing: share of the label mass spread over all classes, in the main loss.
     """
 
     auxiliary: bool = True
     loss_weighting: bool = True
     regularization: bool = True
     learned_targets: bool = True
-    normalizer: Normalizer = "softmax"
+    fixed_targets: Normalizer = "softmax"
     stop_targets: bool = True
     stop_weights: bool = False
     uniform_floor: float = 0.0
     label_smoothing: float = 0.05
 
     def __post_init__(self) -> None:
-        """Refuse combinations that mean nothing."""
+        """Refuse values out of range and combinations that mean nothing."""
+        for name in (
+            "auxiliary",
+            "loss_weighting",
+            "regularization",
+            "learned_targets",
+            "stop_targets",
+            "stop_weights",
+        ):
+            check_choice(name, getattr(self, name), (True, False))
+        check_choice("fixed_targets", self.fixed_targets, get_args(Normalizer))
         for name in ("uniform_floor", "label_smoothing"):
-            if not 0.0 <= getattr(self, name) <= 1.0:
-                raise ValueError(f"{name}={getattr(self, name)}: expected a share in [0, 1]")
-        if (self.loss_weighting or self.regularization) and not self.auxiliary:
-            raise ValueError("loss_weighting and regularization need auxiliary=True")
+            check_number(name, getattr(self, name), 0.0, 1.0, fix="it is a share")
+        for name in ("loss_weighting", "regularization"):
+            if getattr(self, name) and not self.auxiliary:
+                raise ValueError(
+                    f"{name}=True: expected auxiliary=True with it; the term is made of the "
+                    "losses of auxiliary paths"
+                )
         if self.learned_targets and not self.regularization:
-            raise ValueError("learned_targets=True needs regularization=True")
+            raise ValueError(
+                "learned_targets=True: expected regularization=True with it; targets are for the "
+                "regularization"
+            )
+
+
+class GatePenalty(NamedTuple):
+    """What the gate adds to a loss, means over the batch; `total` is the weighted sum."""
+
+    total: Float[Array, ""]
+    auxiliary: Float[Array, ""]
+    regularization: Float[Array, ""]
+    anchor: Float[Array, ""]
 
 
 class LossTerms(NamedTuple):
@@ -93,7 +157,7 @@ def cross_entropy(
 
 
 def loss_targets(
-    losses: Float[Array, "b k"], normalizer: Normalizer, tau: float | Array = 1.0
+    losses: Float[Array, "b k"], form: Normalizer, tau: float | Array = 1.0
 ) -> Float[Array, "b k"]:
     r"""Fixed fusion-weight targets from the auxiliary losses of each example.
 
@@ -106,9 +170,71 @@ def loss_targets(
 
     Source: Shim (2020), Eq. 3.1. Deviation: the second form.
     """
-    if normalizer == "softmax_sigmoid":
-        return normalize(jnp.exp(-losses), normalizer)
+    if form == "softmax_sigmoid":
+        return normalize(jnp.exp(-losses), form)
     return jax.nn.softmax(-losses / tau, axis=-1)
+
+
+def gate_penalty(
+    config: LossConfig,
+    params: LossParams,
+    weights: Float[Array, "b k"],
+    aux_losses: Float[Array, "b k"],
+    targets: Float[Array, "b k"] | None = None,
+    *,
+    target_losses: Float[Array, "b k"] | None = None,
+    counted: Float[Array, " b"] | None = None,
+) -> GatePenalty:
+    r"""What Equations 3.1 and 3.2 add to the loss of any main task.
+
+    .. math::
+        \alpha \sum_k w_k L^{aux}_k + \beta \sum_k (w_k - t_k)^2
+            + \lambda \sum_k \left(t_k - \text{softmax}(-L^{aux}/\tau)_k\right)^2
+
+    averaged over the examples of the batch. With `loss_weighting=False` the alpha term is the
+    mean of the auxiliary losses (ARGate-WS).
+
+    Args:
+        config: which terms are there; static.
+        params: alpha, beta, tau and the anchor weight (lambda).
+        weights: fusion weights w.
+        aux_losses: loss of each auxiliary path, per example.
+        targets: learned targets f_k(aux_losses); None for the fixed ones.
+        target_losses: losses that the fixed targets are made of; None for `aux_losses`.
+        counted: which examples the weights are regularized in, 1 or 0; None for all.
+
+    Returns:
+        The terms, scalars.
+
+    Source: Shim (2020), Eq. 3.1 and 3.2. Deviation: the anchor term, off by default.
+
+    Example:
+        >>> w, losses = jnp.full((1, 2), 0.5), jnp.array([[1.0, 3.0]])
+        >>> float(gate_penalty(LossConfig(), LossParams(beta=0.0), w, losses).auxiliary)
+        2.0
+    """
+    zero = jnp.zeros((), weights.dtype)
+    if not config.auxiliary:
+        return GatePenalty(zero, zero, zero, zero)
+    if config.loss_weighting:
+        w = jax.lax.stop_gradient(weights) if config.stop_weights else weights
+        floor = config.uniform_floor
+        w = (1.0 - floor) * w + floor / weights.shape[-1]
+        auxiliary = jnp.mean(jnp.sum(w * aux_losses, axis=-1))
+    else:
+        auxiliary = jnp.mean(aux_losses)
+    regularization = anchor = zero
+    if config.regularization:
+        given = aux_losses if target_losses is None else target_losses
+        given = jax.lax.stop_gradient(given) if config.stop_targets else given
+        fixed = loss_targets(given, config.fixed_targets, params.tau)
+        target = fixed if targets is None else targets
+        share = jnp.ones(weights.shape[:1]) if counted is None else counted
+        regularization = jnp.mean(share * jnp.sum((weights - target) ** 2, axis=-1))
+        if targets is not None:
+            anchor = jnp.mean(share * jnp.sum((targets - fixed) ** 2, axis=-1))
+    total = params.alpha * auxiliary + params.beta * regularization + params.anchor * anchor
+    return GatePenalty(total, auxiliary, regularization, anchor)
 
 
 def argate_loss(
@@ -119,17 +245,13 @@ def argate_loss(
     weights: Float[Array, "b k"],
     aux_losses: Float[Array, "b k"] | None = None,
     targets: Float[Array, "b k"] | None = None,
-    target_losses: Float[Array, "b k"] | None = None,
-    counted: Float[Array, " b"] | None = None,
 ) -> LossTerms:
-    r"""The training loss of a gated network with auxiliary paths.
+    r"""The training loss of a classifier with a gate and auxiliary paths.
 
-    .. math::
-        L = L_{main} + \alpha \sum_k w_k L^{aux}_k + \beta \sum_k (w_k - t_k)^2
-            + \lambda \sum_k \left(t_k - \text{softmax}(-L^{aux}/\tau)_k\right)^2
+    .. math:: L = L_{main} + P(w, L^{aux}, t)
 
-    averaged over the examples of the batch. With `loss_weighting=False` the alpha term is the
-    mean of the auxiliary losses (ARGate-WS).
+    with the cross entropy of the main model and the penalty P of `gate_penalty`, averaged over the
+    examples of the batch.
 
     Args:
         config: which terms are there; static.
@@ -139,34 +261,21 @@ def argate_loss(
         weights: fusion weights w.
         aux_losses: cross entropy of each auxiliary path, per example; None without auxiliary paths.
         targets: learned targets f_k(aux_losses); None for the fixed ones.
-        target_losses: losses that the fixed targets are made of; None for `aux_losses`.
-        counted: which examples the weights are regularized in, 1 or 0; None for all.
 
     Returns:
         The terms, scalars.
 
-    Source: Shim (2020), Eq. 3.1 and 3.2. Deviation: the anchor term, off by default.
+    Source: Shim (2020), Eq. 3.1 and 3.2.
+
+    Example:
+        >>> logits, labels = jnp.zeros((1, 2)), jnp.array([0])
+        >>> terms = argate_loss(LossConfig(), LossParams(), logits, labels, jnp.ones((1, 3)) / 3)
+        >>> round(float(terms.total), 4)
+        0.6931
     """
     main = jnp.mean(cross_entropy(logits, labels, config.label_smoothing))
-    zero = jnp.zeros_like(main)
     if not config.auxiliary or aux_losses is None:
+        zero = jnp.zeros_like(main)
         return LossTerms(main, main, zero, zero, zero)
-    if config.loss_weighting:
-        w = jax.lax.stop_gradient(weights) if config.stop_weights else weights
-        floor = config.uniform_floor
-        w = (1.0 - floor) * w + floor / weights.shape[-1]
-        auxiliary = jnp.mean(jnp.sum(w * aux_losses, axis=-1))
-    else:
-        auxiliary = jnp.mean(aux_losses)
-    regularization = anchor = zero
-    if config.regularization:
-        seen = aux_losses if target_losses is None else target_losses
-        seen = jax.lax.stop_gradient(seen) if config.stop_targets else seen
-        fixed = loss_targets(seen, config.normalizer, params.tau)
-        target = fixed if targets is None else targets
-        share = jnp.ones(weights.shape[:1]) if counted is None else counted
-        regularization = jnp.mean(share * jnp.sum((weights - target) ** 2, axis=-1))
-        if targets is not None:
-            anchor = jnp.mean(share * jnp.sum((targets - fixed) ** 2, axis=-1))
-    total = main + params.alpha * auxiliary + params.beta * regularization + params.anchor * anchor
-    return LossTerms(total, main, auxiliary, regularization, anchor)
+    gate = gate_penalty(config, params, weights, aux_losses, targets)
+    return LossTerms(main + gate.total, main, gate.auxiliary, gate.regularization, gate.anchor)

@@ -8,18 +8,29 @@ Equation 3.2) exist in training only.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal, NamedTuple, cast
+from typing import Any, Literal, NamedTuple, cast, get_args
 
 import flax.linen as nn
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Key
 
+from fusion._checks import (
+    check_choice,
+    check_count,
+    check_counts,
+    check_key,
+    check_number,
+    check_type,
+)
 from fusion.encoders import EncoderConfig, encoder, stacked_dense
 from fusion.gating import (
+    Fusion,
     Gate,
     Normalizer,
+    Scaling,
     apply_weights,
+    available_weights,
     drop_modalities,
     embrace,
     oracle_weights,
@@ -35,10 +46,10 @@ __all__ = [
     "ModelConfig",
     "Recipe",
     "auxiliary_logits",
+    "check_windows",
     "count_parameters",
     "export",
     "init",
-    "loss_config",
     "match_parameters",
     "predict",
 ]
@@ -52,36 +63,29 @@ class Recipe:
 
     Attributes:
         gate: where the fusion weights come from; `"none"` is plain late fusion.
-        auxiliary: unisensory paths that share the encoders (WS).
-        loss_weighting: auxiliary losses weighted by the fusion weights (ALW).
-        regularization: fusion weights pulled to targets (FWR).
-        learned_targets: targets from the monotone lattice.
+        loss: which terms of the loss it has: auxiliary paths (WS), weighted (ALW), targets (FWR).
         modality_dropout: probability that a sensor's features are dropped in training.
     """
 
-    gate: Literal["none", "learned", "oracle", "embrace"] = "none"
-    auxiliary: bool = False
-    loss_weighting: bool = False
-    regularization: bool = False
-    learned_targets: bool = False
+    gate: Literal["none", "learned", "oracle", "embrace"]
+    loss: LossConfig
     modality_dropout: float = 0.0
 
 
+_MAIN = LossConfig(
+    auxiliary=False, loss_weighting=False, regularization=False, learned_targets=False
+)
+_PATHS = dataclasses.replace(_MAIN, auxiliary=True)
+
 MODELS: dict[str, Recipe] = {
-    "baseline": Recipe(),
-    "netgated": Recipe(gate="learned"),
-    "argate_ws": Recipe(gate="learned", auxiliary=True),
-    "argate_plus": Recipe(gate="learned", auxiliary=True, loss_weighting=True, regularization=True),
-    "argate_l": Recipe(
-        gate="learned",
-        auxiliary=True,
-        loss_weighting=True,
-        regularization=True,
-        learned_targets=True,
-    ),
-    "modality_dropout": Recipe(modality_dropout=0.2),
-    "embracenet": Recipe(gate="embrace"),
-    "oracle": Recipe(gate="oracle", auxiliary=True),
+    "baseline": Recipe("none", _MAIN),
+    "netgated": Recipe("learned", _MAIN),
+    "argate_ws": Recipe("learned", _PATHS),
+    "argate_plus": Recipe("learned", LossConfig(learned_targets=False)),
+    "argate_l": Recipe("learned", LossConfig()),
+    "modality_dropout": Recipe("none", _MAIN, modality_dropout=0.2),
+    "embracenet": Recipe("embrace", _MAIN),
+    "oracle": Recipe("oracle", _PATHS),
 }
 """The models by name. The first five are the source's; the others are references."""
 
@@ -100,9 +104,10 @@ class ModelConfig:
         embrace_width: width that EmbraceNet docks each sensor's features to before it draws.
         dropout: rate after fusion and in the head, in training.
         fusion: `"concat"` keeps each sensor's features apart, `"sum"` adds them.
+        scale: `"mean"` multiplies weights by K, `"max"` divides them by the largest.
         normalizer: of the fusion weights, see `fusion.gating.normalize`.
         weight_sharing: auxiliary paths share the encoders; else they have their own (ablation).
-        loss_weighting, regularization, learned_targets: override the recipe (ablation).
+        loss: terms of the loss and its gradient paths; None for those of the model's recipe.
         targets: the lattice of Equation 3.2.
     """
 
@@ -116,37 +121,48 @@ class ModelConfig:
     aux_width: int = 0
     embrace_width: int = 128
     dropout: float = 0.2
-    fusion: Literal["concat", "sum"] = "concat"
-    scale: Literal["mean", "max"] = "mean"
+    fusion: Fusion = "concat"
+    scale: Scaling = "mean"
     normalizer: Normalizer = "softmax"
     weight_sharing: bool = True
-    loss_weighting: bool | None = None
-    regularization: bool | None = None
-    learned_targets: bool | None = None
+    loss: LossConfig | None = None
     targets: TargetConfig = dataclasses.field(default_factory=TargetConfig)
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built, by name and value."""
-        if self.model not in MODELS:
-            raise ValueError(f"model={self.model!r} is not known; known: {', '.join(MODELS)}")
-        if self.fusion not in ("concat", "sum"):
-            raise ValueError(f"fusion={self.fusion!r}: expected 'concat' or 'sum'")
-        if not 0.0 <= self.dropout < 1.0:
-            raise ValueError(f"dropout={self.dropout}: expected a rate in [0, 1)")
-        for name in ("n_sensors", "n_times", "n_classes", "gate_width"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)}: expected at least 1")
+        check_choice("model", self.model, MODELS)
+        for name, options in (("fusion", Fusion), ("scale", Scaling), ("normalizer", Normalizer)):
+            check_choice(name, getattr(self, name), get_args(options))
+        check_choice("weight_sharing", self.weight_sharing, (True, False))
+        check_number("dropout", self.dropout, 0.0, 1.0, below=True, fix="it is a rate")
+        for name in ("n_sensors", "n_times", "gate_width", "embrace_width"):
+            check_count(name, getattr(self, name))
+        check_count("n_classes", self.n_classes, 2)
+        check_count("aux_width", self.aux_width, 0)
+        check_counts("head_widths", self.head_widths)
+        check_type("encoder", self.encoder, EncoderConfig, "build an EncoderConfig")
+        check_type("targets", self.targets, TargetConfig, "build a TargetConfig")
+        if self.encoder.levels and len(self.encoder.levels) != self.n_sensors:
+            raise ValueError(
+                f"encoder.levels={len(self.encoder.levels)} rows: expected one for each of "
+                f"{self.n_sensors} sensors; make levels with reading_levels"
+            )
+        if self.loss is None:
+            return
+        check_type("loss", self.loss, LossConfig, "build a LossConfig")
+        gate = MODELS[self.model].gate
+        for name in ("loss_weighting", "regularization"):
+            if getattr(self.loss, name) and gate != "learned":
+                raise ValueError(
+                    f"loss.{name}=True: expected a model with a learned gate, {self.model!r} has "
+                    f"none; use loss.{name}=False"
+                )
 
     @property
     def recipe(self) -> Recipe:
-        """The model's recipe with this config's ablations applied."""
+        """The model's recipe, with the loss of this config where it has one."""
         base = MODELS[self.model]
-        flags = {
-            name: value
-            for name in ("loss_weighting", "regularization", "learned_targets")
-            if (value := getattr(self, name)) is not None
-        }
-        return dataclasses.replace(base, **flags)
+        return base if self.loss is None else dataclasses.replace(base, loss=self.loss)
 
 
 class MainOutput(NamedTuple):
@@ -173,6 +189,7 @@ class FusionNet(nn.Module):
         x: Float[Array, "b k t"],
         key: Array | None = None,
         failed: Bool[Array, "b k"] | None = None,
+        available: Bool[Array, "b k"] | None = None,
     ) -> MainOutput:
         """Run the network.
 
@@ -180,23 +197,32 @@ class FusionNet(nn.Module):
             x: windows, `[batch, sensor, time]`, scaled to [-1, 1].
             key: PRNG key in training (dropout, random fusion); None at inference.
             failed: which sensors failed; read by the oracle gate only.
+            available: which sensors are there, see `predict`; all of them when None.
         """
         config, recipe = self.config, self.config.recipe
         b, k, t = x.shape
         features = encoder(config.encoder, t, "encoder")(jnp.transpose(x, (1, 0, 2)))
+        if available is not None:
+            features = jnp.where(available.T[:, :, None], features, jnp.zeros_like(features))
         weights = jnp.full((b, k), 1.0 / k, x.dtype)
         if recipe.gate == "learned":
             weights = Gate(config.gate_width, config.normalizer, name="gate")(features)
         elif recipe.gate == "oracle":
             if failed is None:
-                raise ValueError("the oracle gate needs `failed`, the mask of failed sensors")
-            weights = oracle_weights(failed)
+                raise ValueError(
+                    "failed=None: expected the mask of failed sensors for the oracle gate; give it"
+                )
+            weights = oracle_weights(failed if available is None else failed | ~available)
+        if available is not None:
+            weights = available_weights(weights, available)
         used = features
         if key is not None and recipe.modality_dropout > 0.0:
-            used = drop_modalities(jax.random.fold_in(key, 0), used, recipe.modality_dropout)
+            drop_key = jax.random.fold_in(key, 0)
+            used = drop_modalities(used, recipe.modality_dropout, key=drop_key)
         if recipe.gate == "embrace":
             docked = nn.relu(stacked_dense(self, "dock", used, config.embrace_width))
-            h = embrace(docked, None if key is None else jax.random.fold_in(key, 1))
+            keep = None if available is None else available.astype(docked.dtype)
+            h = embrace(docked, keep, key=None if key is None else jax.random.fold_in(key, 1))
         else:
             h = apply_weights(used, weights, config.fusion, config.scale)
         for layer, width in enumerate((*config.head_widths, config.n_classes)):
@@ -228,45 +254,105 @@ class AuxiliaryPaths(nn.Module):
         return jnp.transpose(logits, (1, 0, 2))
 
 
-def init(key: Array, config: ModelConfig) -> Params:
-    """Draw the parameters: `main`, and `aux` and `targets` where the recipe has them."""
+def init(key: Key[Array, ""], config: ModelConfig) -> Params:
+    """Draw the parameters: `main`, and `aux` and `targets` where the loss has them.
+
+    Raises:
+        ValueError: a legacy key.
+
+    Example:
+        >>> config = ModelConfig("argate_ws", n_sensors=2, n_times=1, n_classes=3)
+        >>> sorted(init(jax.random.key(0), config))
+        ['aux', 'main']
+    """
+    check_key(key)
     main_key, aux_key, target_key = jax.random.split(key, 3)
     x = jnp.zeros((1, config.n_sensors, config.n_times))
     failed = jnp.zeros((1, config.n_sensors), bool)
     features = jnp.zeros((config.n_sensors, 1, config.encoder.features))
     params = {"main": FusionNet(config).init(main_key, x, failed=failed)["params"]}
-    if config.recipe.auxiliary:
+    loss = config.recipe.loss
+    if loss.auxiliary:
         params["aux"] = AuxiliaryPaths(config).init(aux_key, x, features)["params"]
-    if config.recipe.learned_targets:
+    if loss.learned_targets:
         params["targets"] = init_targets(target_key, config.targets, config.n_sensors)
     return params
 
 
 def predict(
-    main: Params,
     config: ModelConfig,
+    main: Params,
     x: Float[Array, "b k t"],
     failed: Bool[Array, "b k"] | None = None,
     *,
-    key: Array | None = None,
+    available: Bool[Array, "b k"] | None = None,
+    key: Key[Array, ""] | None = None,
 ) -> MainOutput:
     """Run the main model; no auxiliary parameter is read.
 
+    A sensor is absent where `available` is False, and, without a key, where its window holds NaN.
+    The readings and features of an absent sensor have no influence: the gate reads zeros in their
+    place, and the fusion weights of the others are scaled to the sum of all. Without any sensor
+    all weights are zero and the logits tell nothing.
+
     Args:
-        main: `export(params)`.
         config: static.
+        main: `export(params)`.
         x: windows, `[batch, sensor, time]`, scaled to [-1, 1].
-        failed: which sensors failed; read by the oracle gate only.
+        failed: which sensors failed; the oracle gate reads it, the other models are not told.
+        available: False for sensors that sent nothing; all are there when None.
         key: PRNG key of dropout and random fusion, in training only.
 
     Returns:
         Logits, fusion weights and features.
+
+    Raises:
+        ValueError: a shape that is not the model's, a legacy key, an oracle without `failed`.
+
+    Example:
+        >>> config = ModelConfig("netgated", n_sensors=3, n_times=1, n_classes=2)
+        >>> main = export(init(jax.random.key(0), config))
+        >>> x = jnp.array([[[0.1], [jnp.nan], [0.3]]])
+        >>> predict(config, main, x).weights.tolist()
+        [[0.5, 0.0, 0.5]]
     """
-    return cast(MainOutput, FusionNet(config).apply({"params": main}, x, key, failed))
+    if key is not None:
+        check_key(key)
+    check_windows(config, x)
+    for name, mask in (("failed", failed), ("available", available)):
+        if mask is not None and mask.shape != x.shape[:2]:
+            raise ValueError(
+                f"{name}.shape={tuple(mask.shape)}: expected {tuple(x.shape[:2])}; give one value "
+                "for each sensor of each window"
+            )
+    if key is None:
+        there = ~jnp.any(jnp.isnan(x), axis=-1)
+        available = there if available is None else available & there
+    if available is not None:
+        x = jnp.where(available[:, :, None], x, jnp.zeros_like(x))
+    net = FusionNet(config)
+    return cast(MainOutput, net.apply({"params": main}, x, key, failed, available))
+
+
+def check_windows(config: ModelConfig, x: Any) -> None:
+    """Refuse windows of another shape than the model's, with the likely reason.
+
+    Raises:
+        ValueError: no batch axis, times before sensors, or other numbers of sensors or samples.
+    """
+    k, t = config.n_sensors, config.n_times
+    if x.ndim == 3 and x.shape[1:] == (k, t):
+        return
+    fix = "the model was made for other sensors or windows"
+    if x.shape == (k, t):
+        fix = "add the batch axis: x[None]"
+    elif x.ndim == 3 and x.shape[1:] == (t, k):
+        fix = "sensors come before samples: x.transpose(0, 2, 1)"
+    raise ValueError(f"x.shape={tuple(x.shape)}: expected [batch, {k} sensors, {t} samples]; {fix}")
 
 
 def auxiliary_logits(
-    params: Params, config: ModelConfig, x: Float[Array, "b k t"], features: Float[Array, "k b f"]
+    config: ModelConfig, params: Params, x: Float[Array, "b k t"], features: Float[Array, "k b f"]
 ) -> Float[Array, "b k c"]:
     """Logits of the unisensory paths, from the features of the main model."""
     return cast(Array, AuxiliaryPaths(config).apply({"params": params["aux"]}, x, features))
@@ -275,19 +361,6 @@ def auxiliary_logits(
 def export(params: Params) -> Params:
     """What inference needs: the main model's parameters, without auxiliary paths and lattice."""
     return params["main"]
-
-
-def loss_config(config: ModelConfig, **options: Any) -> LossConfig:
-    """The loss terms that belong to this model; `options` are the fields of `LossConfig`."""
-    recipe = config.recipe
-    return LossConfig(
-        auxiliary=recipe.auxiliary,
-        loss_weighting=recipe.loss_weighting,
-        regularization=recipe.regularization,
-        learned_targets=recipe.learned_targets,
-        normalizer=config.normalizer,
-        **options,
-    )
 
 
 def count_parameters(config: ModelConfig) -> dict[str, int]:
@@ -309,7 +382,9 @@ def match_parameters(config: ModelConfig, reference: ModelConfig) -> ModelConfig
         ValueError: no width brings the totals within 2 %.
     """
     if not config.head_widths:
-        raise ValueError("head_widths is empty: matching needs one hidden layer in the head")
+        raise ValueError(
+            "head_widths=(): expected at least one width; matching moves the first hidden layer"
+        )
     wanted = count_parameters(reference)["total"]
 
     def at(width: int) -> ModelConfig:
@@ -321,7 +396,8 @@ def match_parameters(config: ModelConfig, reference: ModelConfig) -> ModelConfig
     total = count_parameters(matched)["total"]
     if abs(total - wanted) > 0.02 * wanted:
         raise ValueError(
-            f"{config.model} has {total} parameters with a head of {width}, {reference.model} has "
-            f"{wanted}: not within 2 %; change encoder.features or head_widths"
+            f"head_widths={matched.head_widths}: expected {wanted} parameters within 2 %, as "
+            f"{reference.model!r} has, {config.model!r} has {total}; change encoder.features or "
+            "head_widths"
         )
     return matched

@@ -10,13 +10,59 @@ from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
-__all__ = ["plot_channel_weights", "plot_confusion", "plot_gate", "plot_training"]
+__all__ = ["plot_cases", "plot_channel_weights", "plot_confusion", "plot_gate", "plot_training"]
 
 Values = ArrayLike | Sequence[Any]
 
 CLEAN = "#0072b2"
 FAILED = "#d55e00"
 LINES = ("#0072b2", "#d55e00", "#009e73", "#cc79a7", "#e69f00", "#56b4e9", "#000000")
+
+
+def plot_cases(
+    cases: Mapping[str, tuple[float, float | None, float | None]], *, title: str = "Accuracy"
+) -> Figure:
+    """Draw the accuracy of several cases as bars, with marks for printed and best possible values.
+
+    Args:
+        cases: name -> (accuracy, the source's, the ceiling) in percent; None where not known.
+        title: of the figure.
+
+    Returns:
+        The figure, unsaved.
+
+    Raises:
+        ValueError: no cases.
+    """
+    if not cases:
+        raise ValueError("cases={}: expected at least one case; give its accuracy")
+    figure = Figure(figsize=(7.0, 1.3 + 0.55 * len(cases)), layout="constrained")
+    axes = figure.subplots()
+    rows = range(len(cases))
+    axes.barh(rows, [value for value, _, _ in cases.values()], color=CLEAN, alpha=0.6, height=0.6)
+    for column, color, label in ((1, FAILED, "source"), (2, "black", "best possible")):
+        marks = [
+            (row[column], i) for i, row in enumerate(cases.values()) if row[column] is not None
+        ]
+        for i, (value, row) in enumerate(marks):
+            axes.plot(
+                [value, value],
+                [row - 0.38, row + 0.38],
+                color=color,
+                linewidth=2.5,
+                label=label if i == 0 else None,
+            )
+    for row, (value, _, _) in enumerate(cases.values()):
+        axes.text(1.0, row, f"{value:.1f} %", va="center", fontsize=9, color="white")
+    axes.set_yticks(rows, list(cases))
+    axes.invert_yaxis()
+    axes.set_xlim(0.0, 100.0)
+    axes.set_xlabel("accuracy, %")
+    axes.set_title(title, fontsize=10)
+    axes.spines[["top", "right"]].set_visible(False)
+    if axes.get_legend_handles_labels()[1]:
+        axes.legend(frameon=False, fontsize=8, loc="lower left", bbox_to_anchor=(0.1, 1.0))
+    return figure
 
 
 def plot_confusion(

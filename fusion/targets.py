@@ -9,6 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from fusion._checks import check_key
 from fusion.lattice import deep_lattice
 from fusion.lattice.checks import refusal, require_count, require_range
 from fusion.lattice.deep_lattice import DeepLatticeConfig, DeepLatticeParams
@@ -75,6 +76,7 @@ def _own_first(n_sensors: int) -> np.ndarray:
 
 def init_targets(key: Key[Array, ""], config: TargetConfig, n_sensors: int) -> DeepLatticeParams:
     """Parameters of the K networks, stacked on a leading axis."""
+    check_key(key)
     keys = jax.random.split(key, n_sensors)
     return jax.vmap(deep_lattice.init, (0, None))(keys, lattice_config(config, n_sensors))
 

@@ -1,31 +1,24 @@
 """Training: one epoch is one `lax.scan`; seeds and hyper-parameters are arguments, so they vmap.
 
-`init_state` and `make_epoch` are pure; jit and vmap are the caller's. `fit` is the host loop around
-them: corruption, checkpoints, resume, and a clear stop on a loss that is not finite.
+`init_state` and `make_epoch` are pure; jit and vmap are the caller's. `fusion.fit` is the host loop
+around them: corruption, checkpoints, resume, and a clear stop on a loss that is not finite.
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Callable
-from typing import Any, Literal, NamedTuple
+from collections.abc import Callable, Iterable
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
-from fusion.failures import FailureKind, Protocol, corrupt
+from fusion._checks import check_choice, check_count, check_key, check_number
+from fusion.failures import FAILURE_KINDS, FailureKind, Protocol, corrupt
 from fusion.losses import LossParams, LossTerms, argate_loss, cross_entropy
-from fusion.models import (
-    MainOutput,
-    ModelConfig,
-    Params,
-    auxiliary_logits,
-    init,
-    loss_config,
-    predict,
-)
+from fusion.models import MainOutput, ModelConfig, Params, auxiliary_logits, init, predict
 from fusion.targets import apply_targets, project_targets
 
 __all__ = [
@@ -34,20 +27,55 @@ __all__ = [
     "TrainConfig",
     "TrainState",
     "batch_loss",
-    "evaluate",
     "init_state",
     "make_epoch",
     "make_train",
+    "predict_batches",
     "train_step",
 ]
 
 
-class HyperParams(NamedTuple):
-    """What a sweep may vary; scalars, so `jax.vmap` runs over them without recompiling."""
+Schedule = Literal["cosine", "constant"]
 
+
+class _HyperParams(NamedTuple):
     learning_rate: float | Array = 2e-3
     weight_decay: float | Array = 1e-3
     loss: LossParams = LossParams()
+
+
+class HyperParams(_HyperParams):
+    """What a sweep may vary; scalars, so `jax.vmap` runs over them without recompiling.
+
+    Attributes:
+        learning_rate: of Adam, >= 0; the start of the schedule.
+        weight_decay: decoupled, >= 0.
+        loss: weights of the terms of the loss.
+
+    Raises:
+        ValueError: a number out of its range. Arrays and traced values are not looked at.
+
+    Example:
+        >>> HyperParams(1e-2).weight_decay
+        0.001
+    """
+
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        learning_rate: Any = 2e-3,
+        weight_decay: Any = 1e-3,
+        loss: Any = LossParams(),  # noqa: B008
+    ) -> HyperParams:
+        """Check the numbers that are given as numbers."""
+        check_number("learning_rate", learning_rate, 0.0, fix="2e-3 is usual")
+        check_number("weight_decay", weight_decay, 0.0, fix="0 turns it off")
+        return super().__new__(cls, learning_rate, weight_decay, loss)
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Any]) -> HyperParams:
+        return cls(*iterable)
 
 
 @dataclasses.dataclass(frozen=True)
@@ -60,31 +88,21 @@ class TrainConfig:
         schedule: of the learning rate, `"cosine"` to zero or `"constant"`.
         clip_norm: bound of the gradient's global norm.
         jitter: standard deviation of a random gain per channel and example, in training.
-        stop_targets, stop_weights, uniform_floor, label_smoothing: see `fusion.losses.LossConfig`.
     """
 
     epochs: int = 20
     batch_size: int = 64
-    schedule: Literal["cosine", "constant"] = "cosine"
+    schedule: Schedule = "cosine"
     clip_norm: float = 5.0
     jitter: float = 0.0
-    stop_targets: bool = True
-    stop_weights: bool = False
-    uniform_floor: float = 0.0
-    label_smoothing: float = 0.05
 
     def __post_init__(self) -> None:
         """Refuse sizes that make no run."""
         for name in ("epochs", "batch_size"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name}={getattr(self, name)}: expected at least 1")
-        if self.schedule not in ("cosine", "constant"):
-            raise ValueError(f"schedule={self.schedule!r}: expected 'cosine' or 'constant'")
-
-    def loss_options(self) -> dict[str, Any]:
-        """The fields that belong to `LossConfig`."""
-        names = ("stop_targets", "stop_weights", "uniform_floor", "label_smoothing")
-        return {name: getattr(self, name) for name in names}
+            check_count(name, getattr(self, name))
+        check_choice("schedule", self.schedule, get_args(Schedule))
+        check_number("clip_norm", self.clip_norm, 0.0, above=True, fix="1e9 clips nothing")
+        check_number("jitter", self.jitter, 0.0, fix="0 turns it off")
 
 
 class TrainState(NamedTuple):
@@ -108,62 +126,63 @@ def _optimizer(config: TrainConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.scale_by_adam())
 
 
-def init_state(key: Array, model: ModelConfig, config: TrainConfig) -> TrainState:
+def init_state(key: Key[Array, ""], model: ModelConfig, config: TrainConfig) -> TrainState:
     """Fresh parameters and optimizer state."""
     params = init(key, model)
     return TrainState(params, _optimizer(config).init(params), jnp.zeros((), jnp.int32))
 
 
 def batch_loss(
-    params: Params,
     model: ModelConfig,
-    config: TrainConfig,
     hyper: HyperParams,
-    key: Array | None,
+    params: Params,
     x: Float[Array, "b k t"],
     y: Int[Array, " b"],
     failed: Bool[Array, "b k"],
+    *,
+    key: Key[Array, ""] | None = None,
 ) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
     """The training loss of one batch, with its terms and the main model's output.
 
     Differentiable in `params` and in `hyper.loss`; see `fusion.losses.argate_loss`.
     """
-    out = predict(params["main"], model, x, failed, key=key)
+    out = predict(model, params["main"], x, failed, key=key)
     aux_losses = targets = None
-    terms = loss_config(model, **config.loss_options())
-    if terms.auxiliary:
-        aux_logits = auxiliary_logits(params, model, x, out.features)
+    config = model.recipe.loss
+    if config.auxiliary:
+        aux_logits = auxiliary_logits(model, params, x, out.features)
         labels = jnp.broadcast_to(y[:, None], aux_logits.shape[:2])
         aux_losses = cross_entropy(aux_logits, labels)
-        if terms.learned_targets:
-            seen = jax.lax.stop_gradient(aux_losses) if terms.stop_targets else aux_losses
-            targets = apply_targets(model.targets, params["targets"], seen)
-    loss = argate_loss(terms, hyper.loss, out.logits, y, out.weights, aux_losses, targets)
+        if config.learned_targets:
+            given = jax.lax.stop_gradient(aux_losses) if config.stop_targets else aux_losses
+            targets = apply_targets(model.targets, params["targets"], given)
+    loss = argate_loss(config, hyper.loss, out.logits, y, out.weights, aux_losses, targets)
     return loss.total, (loss, out)
 
 
 def train_step(
-    state: TrainState,
     model: ModelConfig,
     config: TrainConfig,
     hyper: HyperParams,
+    state: TrainState,
     rate: Float[Array, ""],
-    key: Array,
     x: Float[Array, "b k t"],
     y: Int[Array, " b"],
     failed: Bool[Array, "b k"],
+    *,
+    key: Key[Array, ""],
 ) -> tuple[TrainState, EpochMetrics]:
     r"""One step of Adam with decoupled weight decay, then the projection of the lattice.
 
     .. math:: \theta \leftarrow \Pi\left(\theta - \eta\,(\text{Adam}(g) + \lambda\,\theta)\right)
 
     Args:
-        state: parameters, optimizer state and step number.
         model, config: static.
         hyper: learning rate, weight decay :math:`\lambda` and loss weights.
+        state: parameters, optimizer state and step number.
         rate: the learning rate :math:`\eta` of this step.
-        key: of dropout and jitter.
         x, y, failed: the batch.
+        key: of dropout and jitter.
 
     Returns:
         The new state and the batch's metrics. Weight decay is not applied to the lattice, whose
@@ -172,8 +191,11 @@ def train_step(
     if config.jitter > 0.0:
         gain = jax.random.normal(jax.random.fold_in(key, 100), x.shape[:2])
         x = x * (1.0 + config.jitter * gain)[:, :, None]
-    gradient = jax.value_and_grad(batch_loss, has_aux=True)
-    (_, (terms, out)), grads = gradient(state.params, model, config, hyper, key, x, y, failed)
+
+    def loss(params: Params) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
+        return batch_loss(model, hyper, params, x, y, failed, key=key)
+
+    (_, (terms, out)), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
     updates, opt_state = _optimizer(config).update(grads, state.opt_state, state.params)
     params: Params = {}
     for part, tree in state.params.items():
@@ -197,11 +219,14 @@ def train_step(
 def make_epoch(
     model: ModelConfig, config: TrainConfig, n_examples: int
 ) -> Callable[..., tuple[TrainState, EpochMetrics]]:
-    """Build `epoch(state, hyper, key, x, y, failed) -> (state, metrics)`, a pure function.
+    """Build `epoch(hyper, state, x, y, failed, *, key) -> (state, metrics)`, a pure function.
 
     One epoch is one scan over shuffled batches. Jit it once; it then serves every seed, every
     corruption and every value of `hyper`. To train S seeds together, vmap it over `state`, `key`
     and whatever else differs.
+
+    Returns:
+        The function; metrics are means over the steps.
 
     Raises:
         ValueError: fewer examples than one batch.
@@ -209,19 +234,21 @@ def make_epoch(
     n_batches = n_examples // config.batch_size
     if n_batches == 0:
         raise ValueError(
-            f"{n_examples} training examples fill no batch of {config.batch_size}; "
-            "choose a smaller batch_size"
+            f"batch_size={config.batch_size}: expected at most {n_examples}, the number of "
+            "training examples; lower it"
         )
     total_steps = config.epochs * n_batches
 
     def epoch(
-        state: TrainState,
         hyper: HyperParams,
-        key: Array,
+        state: TrainState,
         x: Float[Array, "n k t"],
         y: Int[Array, " n"],
         failed: Bool[Array, "n k"],
+        *,
+        key: Key[Array, ""],
     ) -> tuple[TrainState, EpochMetrics]:
+        check_key(key)
         order_key, step_key = jax.random.split(key)
         order = jax.random.permutation(order_key, n_examples)
         order = order[: n_batches * config.batch_size].reshape(n_batches, config.batch_size)
@@ -233,7 +260,7 @@ def make_epoch(
                 phase = jnp.minimum(1.0, state.step.astype(jnp.float32) / total_steps)
                 rate = rate * 0.5 * (1.0 + jnp.cos(jnp.pi * phase))
             return train_step(
-                state, model, config, hyper, rate, key, x[index], y[index], failed[index]
+                model, config, hyper, state, rate, x[index], y[index], failed[index], key=key
             )
 
         state, metrics = jax.lax.scan(step, state, (order, jax.random.split(step_key, n_batches)))
@@ -242,9 +269,9 @@ def make_epoch(
     return epoch
 
 
-def evaluate(
-    main: Params,
+def predict_batches(
     model: ModelConfig,
+    main: Params,
     x: Float[Array, "n k t"],
     failed: Bool[Array, "n k"] | None = None,
     *,
@@ -253,8 +280,8 @@ def evaluate(
     """Logits and fusion weights of many examples, by the exported main model, in chunks.
 
     Args:
-        main: `fusion.models.export(params)`; no auxiliary parameter is read.
         model: static.
+        main: `fusion.models.export(params)`; no auxiliary parameter is read.
         x: windows.
         failed: mask of failed sensors, read by the oracle gate only.
         batch_size: examples per chunk; bounds the memory.
@@ -262,6 +289,7 @@ def evaluate(
     Returns:
         (logits `[n, class]`, fusion weights `[n, sensor]`).
     """
+    check_count("batch_size", batch_size)
     n = x.shape[0]
     mask = jnp.zeros(x.shape[:2], bool) if failed is None else failed
     batch_size = min(batch_size, n)
@@ -273,7 +301,7 @@ def evaluate(
         return padded.reshape(n_chunks, batch_size, *a.shape[1:])
 
     def chunk(inputs: tuple[Array, Array]) -> tuple[Array, Array]:
-        out = predict(main, model, inputs[0], inputs[1])
+        out = predict(model, main, inputs[0], inputs[1])
         return out.logits, out.weights
 
     logits, weights = jax.lax.map(chunk, (chunked(x), chunked(mask)))
@@ -285,30 +313,42 @@ def make_train(
     config: TrainConfig,
     n_examples: int,
     protocol: Protocol,
-    kind: FailureKind,
+    kind: FailureKind | str = "uniform",
     *,
     redraw: bool = True,
 ) -> Callable[..., tuple[TrainState, EpochMetrics]]:
-    """Build `train(key, hyper, x, y) -> (state, metrics)`, the whole run as one pure function.
+    """Build `train(hyper, x, y, *, key) -> (state, metrics)`, the whole run as one pure function.
 
-    For sweeps: `jax.vmap(train, (0, None, None, None))` trains a batch of seeds and
-    `jax.vmap(train, (None, 0, None, None))` a batch of hyper-parameters in one program. It draws
-    the same keys as `fusion.fit.fit`, so that one run of either gives the same network.
+    For sweeps: `jax.vmap(lambda key: train(hyper, x, y, key=key))` trains a batch of seeds and
+    `jax.vmap(lambda hyper: train(hyper, x, y, key=key))` a batch of hyper-parameters in one
+    program. It draws the same keys as `fusion.fit`, so that one run of either gives the same
+    network.
 
     Returns:
         A function whose metrics have a leading axis of epochs.
+
+    Raises:
+        ValueError: an unknown kind, a protocol for another number of sensors, too few examples.
     """
+    check_choice("kind", kind, FAILURE_KINDS)
+    if protocol.n_channels != model.n_sensors:
+        raise ValueError(
+            f"protocol.n_channels={protocol.n_channels}: expected {model.n_sensors}, the sensors "
+            "of the model; build both from the channels of one data set"
+        )
     epoch = make_epoch(model, config, n_examples)
 
     def train(
-        key: Array, hyper: HyperParams, x: Float[Array, "n k t"], y: Int[Array, " n"]
+        hyper: HyperParams, x: Float[Array, "n k t"], y: Int[Array, " n"], *, key: Key[Array, ""]
     ) -> tuple[TrainState, EpochMetrics]:
+        check_key(key)
         init_key, epoch_key, noise_key = (jax.random.fold_in(key, i) for i in range(3))
 
         def body(state: TrainState, index: Array) -> tuple[TrainState, EpochMetrics]:
             draw = jax.random.fold_in(noise_key, index if redraw else 0)
-            noisy, failed = corrupt(draw, x, protocol, kind)
-            return epoch(state, hyper, jax.random.fold_in(epoch_key, index), noisy, y, failed)
+            noisy, failed = corrupt(protocol, x, kind, key=draw)
+            step_key = jax.random.fold_in(epoch_key, index)
+            return epoch(hyper, state, noisy, y, failed, key=step_key)
 
         return jax.lax.scan(body, init_state(init_key, model, config), jnp.arange(config.epochs))
 

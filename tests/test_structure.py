@@ -37,6 +37,7 @@ PUBLIC = (
 )
 """Packages whose `__all__` is kept stable."""
 SAME_MEANING = {
+    "_checks": "refusals of what a user gives",
     "config": "the frozen settings of a part",
     "plots": "pictures of a part",
     "presets": "settings of a part by name",
@@ -49,7 +50,6 @@ SAME_MEANING = {
 """Module names that may occur more than once, and the one thing they mean."""
 KNOWN_CIRCLES: set[tuple[str, str]] = set()
 KNOWN_LONG = {
-    "train_argate",
     "train_rl",
     "train_snn",
 }

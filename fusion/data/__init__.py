@@ -4,6 +4,8 @@ from __future__ import annotations
 
 from pathlib import Path
 
+from fusion._checks import check_choice
+from fusion.data.arrays import from_arrays
 from fusion.data.dataset import (
     Dataset,
     Scale,
@@ -53,6 +55,7 @@ __all__ = [
     "draw_groups",
     "fit_scale",
     "fixed_sets",
+    "from_arrays",
     "load",
     "load_driver",
     "load_har",
@@ -98,13 +101,9 @@ def load(
         >>> load("simulated").channels[:2]
         ('sensor_0', 'sensor_1')
     """
-    if name not in DATASETS:
-        raise ValueError(f"data set {name!r} is unknown, expected one of {list(DATASETS)}")
+    check_choice("name", name, DATASETS)
     split = DATASETS[name][0] if split is None else split
-    if split not in DATASETS[name]:
-        raise ValueError(
-            f"split {split!r} is unknown for {name!r}, expected one of {list(DATASETS[name])}"
-        )
+    check_choice("split", split, DATASETS[name])
     if name == "har":
         return load_har(data_dir, download=download)
     if name == "driver":

@@ -130,11 +130,30 @@ def check_dataset(dataset: Dataset) -> Dataset:
         ValueError: shapes, lengths, label range, an empty class, NaN, or values outside [-1, 1].
     """
     k = dataset.n_channels
+    for field in ("channels", "classes"):
+        names = getattr(dataset, field)
+        if len(set(names)) != len(names):
+            twice = sorted({name for name in names if names.count(name) > 1})
+            raise ValueError(f"{field}={names}: expected different names; rename {twice}")
+    if dataset.n_classes < 2:
+        raise ValueError(
+            f"classes={dataset.classes}: expected at least two; name what is to be told apart"
+        )
     for part in ("train", "test"):
         x: np.ndarray = getattr(dataset, f"{part}_x")
         y: np.ndarray = getattr(dataset, f"{part}_y")
         group: np.ndarray = getattr(dataset, f"{part}_group")
         where = f"{dataset.name} {part} rows"
+        for field, array, kinds, wanted in (
+            ("x", x, "f", "floating point numbers"),
+            ("y", y, "iu", "class numbers"),
+        ):
+            dtype = array.dtype if isinstance(array, np.ndarray) else type(array).__name__
+            if not isinstance(array, np.ndarray) or array.dtype.kind not in kinds:
+                raise TypeError(
+                    f"{part}_{field}={dtype}: expected a numpy array of {wanted}; from_arrays "
+                    "makes a set from lists and names"
+                )
         if x.ndim != 3 or x.shape[1] != k or x.shape[0] == 0:
             raise ValueError(f"{where}: x has shape {x.shape}, expected [N > 0, {k} channels, T]")
         if y.shape != (x.shape[0],) or group.shape != (x.shape[0],):

@@ -82,6 +82,21 @@ def import_torch() -> Any:
     return torch
 
 
+def load_peer() -> Any:
+    """The module `torch_peer.py` beside this file; scripts are files, not a package."""
+    import importlib.util
+    import sys
+
+    name = "bench_fusion_torch_peer"
+    if name not in sys.modules:
+        path = Path(__file__).with_name("torch_peer.py")
+        spec = importlib.util.spec_from_file_location(name, path)
+        assert spec is not None and spec.loader is not None
+        sys.modules[name] = importlib.util.module_from_spec(spec)
+        spec.loader.exec_module(sys.modules[name])
+    return sys.modules[name]
+
+
 def _synthetic(n: int, seed: int) -> Any:
     """A data set with the sizes of HAR; the values do not matter for the time of a step."""
     import numpy as np
@@ -115,7 +130,7 @@ def _ours(settings: Any, n: int, data: Any, key: Any) -> Callable[[], None]:
     def run() -> None:
         nonlocal state, turn
         turn += 1
-        state, metrics = epoch(state, hyper, jax.random.fold_in(key, turn), x, y, failed)
+        state, metrics = epoch(hyper, state, x, y, failed, key=jax.random.fold_in(key, turn))
         jax.block_until_ready((state, metrics))
 
     run()
@@ -134,12 +149,12 @@ def _theirs(kind: str, settings: Any, n: int, data: Any, main: Any) -> Callable[
     """An epoch of PyTorch as a call without arguments."""
     import torch
 
-    from scripts.benchmarks import torch_peer
-
+    torch_peer = load_peer()
     model, config, hyper = settings
     net, optimizer = _peer(kind, model, hyper, main)
     x, y = torch.from_numpy(data.train_x[:n]), torch.from_numpy(data.train_y[:n]).long()
-    epoch = torch_peer.train_epoch(net, optimizer, config, _schedule(config, hyper, n))
+    rate = _schedule(config, hyper, n)
+    epoch = torch_peer.train_epoch(net, optimizer, config, model.recipe.loss, rate)
 
     def run() -> None:
         epoch(x, y)
@@ -152,8 +167,7 @@ def _peer(kind: str, model: Any, hyper: Any, main: Any) -> tuple[Any, Any]:
     """A PyTorch network with our parameters, and its optimizer (the fused one if grouped)."""
     import torch
 
-    from scripts.benchmarks import torch_peer
-
+    torch_peer = load_peer()
     made = torch_peer.LoopNet if kind == "torch_loop" else torch_peer.GroupedNet
     net = made(model)
     torch_peer.load_parameters(net, main)
@@ -191,14 +205,14 @@ def parity(settings: Any, data: Any, key: Any, *, steps: int = 5) -> dict[str, d
     main = init(key, model)["main"]
     batches = [slice(64 * i, 64 * (i + 1)) for i in range(steps)]
     x, y = data.train_x, data.train_y
-    ours_logits = np.asarray(predict(main, model, jnp.asarray(x[:64])).logits)
+    ours_logits = np.asarray(predict(model, main, jnp.asarray(x[:64])).logits)
     hyper = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hyper)
-    step = jax.jit(lambda *a: train_step(a[0], model, config, hyper, *a[1:]))
+    step = jax.jit(lambda *a: train_step(model, config, hyper, *a, key=key))
     losses = []
     for i, batch in enumerate(batches):
         failed = jnp.zeros(x[batch].shape[:2], bool)
         state, metrics = step(
-            state, jnp.float32(rate(i)), key, jnp.asarray(x[batch]), jnp.asarray(y[batch]), failed
+            state, jnp.float32(rate(i)), jnp.asarray(x[batch]), jnp.asarray(y[batch]), failed
         )
         losses.append(float(metrics.loss.total))
     found: dict[str, dict[str, float]] = {}
@@ -213,7 +227,7 @@ def parity(settings: Any, data: Any, key: Any, *, steps: int = 5) -> dict[str, d
             loss = functional.cross_entropy(
                 net(torch.from_numpy(x[batch])),
                 torch.from_numpy(y[batch]).long(),
-                label_smoothing=config.label_smoothing,
+                label_smoothing=model.recipe.loss.label_smoothing,
             )
             optimizer.zero_grad()
             loss.backward()

@@ -185,13 +185,17 @@ def load_parameters(net: LoopNet | GroupedNet, main: dict[str, Any]) -> None:
 
 
 def train_epoch(
-    net: nn.Module, optimizer: torch.optim.Optimizer, config: Any, rate: Callable[[int], float]
+    net: nn.Module,
+    optimizer: torch.optim.Optimizer,
+    config: Any,
+    terms: Any,
+    rate: Callable[[int], float],
 ) -> Callable[[Tensor, Tensor], float]:
     """Build `epoch(x, y) -> mean loss`: shuffled batches, clipping, decoupled weight decay.
 
     Args:
         net, optimizer: to train; the optimizer is `torch.optim.AdamW`.
-        config: a `fusion.train.TrainConfig`.
+        config: a `fusion.train.TrainConfig`; terms: a `fusion.losses.LossConfig`.
         rate: learning rate of a step.
     """
     step = 0
@@ -205,7 +209,7 @@ def train_epoch(
             for group in optimizer.param_groups:
                 group["lr"] = rate(step)
             loss = functional.cross_entropy(
-                net(x[index]), y[index], label_smoothing=config.label_smoothing
+                net(x[index]), y[index], label_smoothing=terms.label_smoothing
             )
             optimizer.zero_grad(set_to_none=True)
             loss.backward()

@@ -36,7 +36,7 @@ class Compare:
 
 def compare(table: dict[str, Any], metric: str) -> list[dict[str, Any]]:
     """Rows of paired differences, for the pairs of which both networks are in the table."""
-    from fusion.evaluate import paired_test
+    from snn_fusion_failure.records.statistics import paired_test
 
     values = {r["model"]: r for r in table["rows"] if r["metric"] == metric}
     rows = []

@@ -33,13 +33,14 @@ TITLE = "Settings of ARGate on validation rows: the preset with one setting chan
 # Equation 3.1 as printed: normalizer, loss weighting, no anchor; noise drawn once.
 LITERAL: dict[str, Any] = {
     "normalizer": "softmax_sigmoid",
+    "fixed_targets": "softmax_sigmoid",
     "uniform_floor": 0.0,
     "anchor": 0.0,
     "redraw": False,
 }
 _BOTH: tuple[dict[str, Any], ...] = (
     {},
-    {"normalizer": "softmax_sigmoid"},
+    {"normalizer": "softmax_sigmoid", "fixed_targets": "softmax_sigmoid"},
     {"uniform_floor": 0.0},
     {"uniform_floor": 0.5},
     {"beta": 0.3},
@@ -47,6 +48,7 @@ _BOTH: tuple[dict[str, Any], ...] = (
     {"scale": "max"},
     LITERAL,
 )
+N_CLEAN = {"har": 1, "driver": 5, "simulated": 1}
 GRID: dict[str, tuple[dict[str, Any], ...]] = {
     "baseline": ({}, {"redraw": False}),
     "argate_ws": ({},),
@@ -64,7 +66,7 @@ GRID: dict[str, tuple[dict[str, Any], ...]] = {
 
 # Where each setting lives.
 _MODEL = ("normalizer", "scale", "weight_sharing")
-_TRAIN = ("uniform_floor",)
+_TERMS = ("uniform_floor", "fixed_targets")
 _LOSS = ("beta", "tau", "anchor")
 
 
@@ -140,35 +142,47 @@ def change(settings: Any, corruption: Any, changes: dict[str, Any]) -> tuple[Any
     def chosen(names: tuple[str, ...]) -> dict[str, Any]:
         return {k: v for k, v in changes.items() if k in names}
 
-    unknown = sorted(set(changes) - {*_MODEL, *_TRAIN, *_LOSS, "redraw"})
+    unknown = sorted(set(changes) - {*_MODEL, *_TERMS, *_LOSS, "redraw"})
     if unknown:
-        known = ", ".join((*_MODEL, *_TRAIN, *_LOSS, "redraw"))
+        known = ", ".join((*_MODEL, *_TERMS, *_LOSS, "redraw"))
         raise ValueError(f"settings {unknown} are not known; known: {known}")
     hyper = settings.hyper
+    loss = dataclasses.replace(settings.model.recipe.loss, **chosen(_TERMS))
     settings = settings._replace(
-        model=dataclasses.replace(settings.model, **chosen(_MODEL)),
-        train=dataclasses.replace(settings.train, **chosen(_TRAIN)),
+        model=dataclasses.replace(settings.model, loss=loss, **chosen(_MODEL)),
         hyper=hyper._replace(loss=hyper.loss._replace(**chosen(_LOSS))),
     )
     return settings, dataclasses.replace(corruption, **chosen(("redraw",)))
 
 
+def options(variant: Variant, preset: str) -> Any:
+    """The options of `train_argate` that a variant changes."""
+    from snn_fusion_failure.commands.argate_runs import Config as RunConfig
+
+    return RunConfig(
+        dataset=variant.dataset,
+        model=variant.model,
+        preset=preset,
+        protocol="random",
+        n_clean=N_CLEAN[variant.dataset],
+        seed=variant.seed,
+    )
+
+
 def execute(variant: Variant, dataset: Any, preset: str) -> dict[str, Any]:
     """Train one variant on the rows that are not held out and score it on those that are."""
-    import jax
-
-    from fusion.loop import fit, test_output
     from fusion.models import count_parameters
-    from snn_fusion_failure.commands.train_argate import Config as TrainConfig
-    from snn_fusion_failure.commands.train_argate import build, scores
-
-    base = TrainConfig(
-        dataset=variant.dataset, model=variant.model, preset=preset, seed=variant.seed
+    from snn_fusion_failure.commands.argate_runs import (
+        build_cases,
+        build_settings,
+        scores,
+        train_and_test,
     )
-    settings, corruption = change(*build(base, dataset), dict(variant.changes))
-    key = jax.random.key(variant.seed)
-    fitted = fit(key, dataset, settings.model, settings.train, settings.hyper, corruption)
-    output = test_output(key, fitted.state, dataset, settings.model, corruption)
+
+    base = options(variant, preset)
+    (case,) = build_cases(base, dataset).values()
+    settings, noise = change(build_settings(base, dataset), case.noise, dict(variant.changes))
+    fitted, output = train_and_test(settings, dataset, noise, variant.seed)
     return scores(output, dataset.n_classes) | {
         "parameters": count_parameters(settings.model),
         "rows": "validation",

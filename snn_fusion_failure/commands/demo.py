@@ -56,7 +56,7 @@ def spiking_robots(config: Config) -> dict[str, Any]:
 def sensor_fusion(config: Config) -> dict[str, Any]:
     """ARGate-L and the baseline on the same corrupted windows."""
     from fusion.data import load
-    from snn_fusion_failure.commands import train_argate
+    from snn_fusion_failure.commands import argate_runs, train_argate
 
     dataset = "har"
     try:
@@ -67,10 +67,12 @@ def sensor_fusion(config: Config) -> dict[str, Any]:
     results = {}
     for model in ("baseline", "argate_l"):
         results[model] = train_argate.main(
-            train_argate.Config(
+            argate_runs.Config(
                 dataset=dataset,
                 model=model,
                 preset="quick",
+                protocol="random",
+                n_clean=1,
                 data_dir=config.data_dir,
                 out=config.out / f"fusion_{model}",
                 overwrite=True,

@@ -134,26 +134,33 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
     import numpy as np
 
     from fusion import evaluate
-    from fusion.loop import fit, test_output
+    from fusion.loop import test_output
     from fusion.models import count_parameters
-    from snn_fusion_failure.commands.train_argate import Config, build, scores
+    from snn_fusion_failure.commands.argate_runs import (
+        Config,
+        build_cases,
+        build_settings,
+        scores,
+        train_and_test,
+    )
 
     config = Config(model=run.model, preset=preset, seed=run.seed, **run.row.settings)
-    settings, corruption = build(config, dataset)
-    key = jax.random.key(run.seed)
-    fitted = fit(key, dataset, settings.model, settings.train, settings.hyper, corruption)
-    output = test_output(key, fitted.state, dataset, settings.model, corruption)
+    settings = build_settings(config, dataset)
+    (case,) = build_cases(config, dataset).values()
+    fitted, output = train_and_test(settings, dataset, case.noise, run.seed)
     record = scores(output, dataset.n_classes) | {
         "parameters": count_parameters(settings.model),
         "epochs": settings.train.epochs,
         "train_loss": fitted.history[-1]["total"],
     }
     if run.row.robustness and run.model != "oracle":
-        record["robustness"] = {}
+        record["robustness"], key = {}, jax.random.key(run.seed)
         for kind in UNSEEN_KINDS:
-            seen = test_output(key, fitted.state, dataset, settings.model, corruption, kind=kind)
+            other = test_output(
+                settings.model, fitted.state, dataset, case.noise, key=key, kind=kind
+            )
             record["robustness"][kind] = 100.0 * evaluate.accuracy(
-                seen.labels, seen.logits.argmax(-1)
+                other.labels, other.logits.argmax(-1)
             )
     if run.row.channel is not None:
         index = dataset.channels.index(run.row.channel)
@@ -205,6 +212,7 @@ def collect(
     import numpy as np
 
     from fusion import evaluate
+    from snn_fusion_failure.records.statistics import paired_test
 
     held = load_runs(table, out, seeds)
     printed = source[table]
@@ -229,7 +237,7 @@ def collect(
             common = sorted(set(a) & set(b))
             if len(common) < 2:
                 continue
-            test = evaluate.paired_test(
+            test = paired_test(
                 [a[s]["accuracy"] for s in common], [b[s]["accuracy"] for s in common]
             )
             studies.append({"row": row, "comparison": f"{better} - {worse}", **test._asdict()})

@@ -14,7 +14,7 @@ from snn_fusion_failure.runs.provenance import provenance
 
 def summarize(values: Sequence[float]) -> dict[str, Any]:
     """`n`, `mean`, `ci95` (Student's t interval of the mean) and the `values` themselves."""
-    from fusion.evaluate import mean_interval
+    from snn_fusion_failure.records.statistics import mean_interval
 
     values = list(values)
     if len(values) == 1:

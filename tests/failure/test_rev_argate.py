@@ -10,6 +10,7 @@ from failure.bnn import BNNConfig
 from failure.models.acquisition import AcquisitionConfig
 from failure.search import bayesopt, runs, spaces
 from failure.search.spaces import Task
+from fusion.losses import LossParams
 
 DIM = 6
 TASK = Task("box", 3.0, DIM)
@@ -58,11 +59,13 @@ def test_loss_is_equation_4_6(trained):
     mask = jnp.ones(120)
     parts = {}
     for name in ("alpha", "beta", "anchor"):
-        only = dataclasses.replace(CONFIG, **{"alpha": 0.0, "beta": 0.0, "anchor": 0.0, name: 1.0})
+        none = LossParams(alpha=0.0, beta=0.0, tau=CONFIG.loss.tau, anchor=0.0)
+        only = dataclasses.replace(CONFIG, loss=none._replace(**{name: 1.0}))
         total, main = rev_argate.loss(only, params, x, y, mask)
         parts[name] = float(total - main)
         assert parts[name] > 0
-    config = dataclasses.replace(CONFIG, alpha=0.5, beta=2.0, anchor=3.0)
+    loss = LossParams(alpha=0.5, beta=2.0, tau=CONFIG.loss.tau, anchor=3.0)
+    config = dataclasses.replace(CONFIG, loss=loss)
     total, main = rev_argate.loss(config, params, x, y, mask)
     expected = float(main) + 0.5 * parts["alpha"] + 2.0 * parts["beta"] + 3.0 * parts["anchor"]
     np.testing.assert_allclose(total, expected, rtol=1e-4)
@@ -102,4 +105,4 @@ def test_search_trains_on_counted_simulations_and_resumes(tmp_path):
 
 def test_bad_configuration():
     with pytest.raises(ValueError, match="tau=0"):
-        rev_argate.RevArgateConfig(tau=0.0)
+        rev_argate.RevArgateConfig(loss=LossParams(tau=0.0))

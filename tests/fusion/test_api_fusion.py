@@ -160,13 +160,13 @@ CASES = [
     ),
     Case(
         "gating.drop_modalities",
-        lambda k, z: gating.drop_modalities(k, z, 0.5),
+        lambda k, z: gating.drop_modalities(z, 0.5, key=k),
         lambda rng: (key(rng), *f32(rng.normal(size=(3, 4, 2)))),
         (1,),
     ),
     Case(
         "gating.embrace",
-        gating.embrace,
+        lambda z, k: gating.embrace(z, key=k),
         lambda rng: (*f32(rng.normal(size=(3, 4, 5))), key(rng)),
     ),
     Case(
@@ -201,7 +201,7 @@ CASES = [
     ),
     Case(
         "failures.draw_mask",
-        lambda k: failures.draw_mask(k, 6, CHANNELS),
+        lambda k: failures.draw_mask(CHANNELS, 6, key=k),
         lambda rng: (key(rng),),
         (),
         INTEGERS,
@@ -209,7 +209,7 @@ CASES = [
     *(
         Case(
             f"failures.apply_failure ({kind})",
-            lambda k, x, m, s, kind=kind: failures.apply_failure(k, x, m, kind, severity=s),
+            lambda k, x, m, s, kind=kind: failures.apply_failure(x, m, kind, key=k, severity=s),
             lambda rng: (
                 key(rng),
                 *f32(rng.uniform(-0.9, 0.9, (3, 2, 8))),
@@ -222,7 +222,7 @@ CASES = [
     ),
     Case(
         "failures.corrupt",
-        lambda k, x: failures.corrupt(k, x, CHANNELS, "gaussian"),
+        lambda k, x: failures.corrupt(CHANNELS, x, "gaussian", key=k),
         lambda rng: (key(rng), *f32(rng.uniform(-0.9, 0.9, (6, 3, 4)))),
         (1,),
     ),

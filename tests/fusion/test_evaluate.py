@@ -19,10 +19,8 @@ from fusion.evaluate import (
     confusion_matrix,
     gap_closure,
     gate_auroc,
-    mean_interval,
     mean_retained_accuracy,
     mean_weights,
-    paired_test,
     retained_accuracy,
     split_accuracy,
 )
@@ -67,7 +65,7 @@ def test_confusion_matrix_counts_pairs(pairs: np.ndarray) -> None:
 
 
 def test_confusion_matrix_refuses_labels_out_of_range() -> None:
-    with pytest.raises(ValueError, match=r"predictions span 0..5, expected 0..4"):
+    with pytest.raises(ValueError, match=r"predictions=array spanning 0..5: expected 0..4"):
         confusion_matrix(np.array([0, 1]), np.array([0, 5]), 5)
 
 
@@ -127,7 +125,7 @@ def test_gate_auroc_of_known_gates() -> None:
         assert math.isnan(gate_auroc(oracle, np.zeros_like(mask), among=among))
     assert mean_weights(oracle, mask) == (pytest.approx(0.5), 0.0)
     assert math.isnan(mean_weights(oracle, np.ones_like(mask))[0])
-    with pytest.raises(ValueError, match=r"among is 'row', expected one of \['pooled'"):
+    with pytest.raises(ValueError, match=r"among='row': expected one of 'pooled'"):
         gate_auroc(oracle, mask, among="row")
 
 
@@ -141,39 +139,7 @@ def test_gap_closure_and_retained_accuracy() -> None:
     assert mean_retained_accuracy({"zero": 0.6, "stuck": 0.8, "gain": 0.4}, 0.8) == pytest.approx(
         0.75
     )
-    with pytest.raises(ValueError, match="clean accuracy is 0"):
+    with pytest.raises(ValueError, match=r"clean=0.0: expected a share"):
         retained_accuracy(0.6, 0.0)
-    with pytest.raises(ValueError, match="no failure kinds"):
+    with pytest.raises(ValueError, match="expected at least one failure kind"):
         mean_retained_accuracy({}, 0.8)
-
-
-@given(st.integers(2, 12), st.floats(0.5, 0.99), st.integers(0, 10_000))
-@settings(max_examples=50, deadline=None)
-def test_interval_and_paired_test_equal_scipy(n: int, level: float, seed: int) -> None:
-    rng = np.random.default_rng(seed)
-    a, b = rng.normal(0.9, 0.02, n), rng.normal(0.88, 0.02, n)
-    interval = mean_interval(a, level=level)
-    low, high = stats.t.interval(level, n - 1, loc=a.mean(), scale=stats.sem(a))
-    np.testing.assert_allclose([interval.low, interval.high], [low, high], rtol=1e-9)
-    ours, theirs = paired_test(a, b, level=level), stats.ttest_rel(a, b)
-    np.testing.assert_allclose([ours.t, ours.p_value], [theirs.statistic, theirs.pvalue], rtol=1e-8)
-    ci = theirs.confidence_interval(level)
-    np.testing.assert_allclose([ours.low, ours.high], [ci.low, ci.high], rtol=1e-7, atol=1e-12)
-    assert ours.n == n and ours.difference == pytest.approx((a - b).mean())
-
-
-def test_paired_test_without_spread_and_bad_input() -> None:
-    same = paired_test([0.5, 0.75], [0.25, 0.5])
-    assert (
-        math.isinf(same.t) and same.t > 0 and same.p_value == 0.0 and same.low == same.high == 0.25
-    )
-    zero = paired_test([0.5, 0.7], [0.5, 0.7])
-    assert zero.t == 0.0 and zero.p_value == 1.0
-    for call, expected in (
-        (lambda: paired_test([0.5, 0.6], [0.5, 0.6, 0.7]), "2 runs against 3"),
-        (lambda: mean_interval([0.5]), "at least two runs"),
-        (lambda: mean_interval([0.5, np.nan]), "a run has failed"),
-        (lambda: mean_interval([0.5, 0.6], level=95.0), "level is 95"),
-    ):
-        with pytest.raises(ValueError, match=expected):
-            call()

@@ -33,7 +33,11 @@ N = 240
 PROTOCOL = random_failing(NAMES, n_clean=2)
 ALL = jnp.ones((N, K), bool)
 
-run_mask = jax.jit(draw_mask, static_argnums=(1, 2))
+_mask = jax.jit(draw_mask, static_argnums=(0, 1))
+
+
+def run_mask(key: jax.Array, n: int, protocol: Protocol) -> jax.Array:
+    return _mask(protocol, n, key=key)
 
 
 @functools.cache
@@ -45,7 +49,7 @@ def windows(t: int) -> jax.Array:
 def fail(key: jax.Array, x: jax.Array, mask: jax.Array) -> dict[str, tuple[jax.Array, jax.Array]]:
     """Every kind, on some channels and on all of them."""
     return {
-        kind: (apply_failure(key, x, mask, kind), apply_failure(key, x, ALL, kind))
+        kind: (apply_failure(x, mask, kind, key=key), apply_failure(x, ALL, kind, key=key))
         for kind in FAILURE_KINDS
     }
 
@@ -113,15 +117,15 @@ def test_only_failed_channels_change(kind: str, t: int) -> None:
 
 
 def test_the_mask_depends_on_the_key_and_not_on_the_kind() -> None:
-    run = jax.jit(corrupt, static_argnums=(2, 3))
+    run, key = jax.jit(corrupt, static_argnums=(0, 2)), jax.random.key(5)
     x = windows(1)
-    y, mask = run(jax.random.key(5), x, PROTOCOL, "uniform")
-    zero, same = run(jax.random.key(5), x, PROTOCOL, "zero")
+    y, mask = run(PROTOCOL, x, "uniform", key=key)
+    zero, same = run(PROTOCOL, x, "zero", key=key)
     np.testing.assert_array_equal(mask, same)
     np.testing.assert_array_equal(zero[:, :, 0] == 0.0, mask)
-    other, moved = run(jax.random.key(6), x, PROTOCOL, "uniform")
+    other, moved = run(PROTOCOL, x, "uniform", key=jax.random.key(6))
     assert not np.array_equal(mask, moved) and not np.array_equal(y, other)
-    np.testing.assert_array_equal(run(jax.random.key(5), x, PROTOCOL, "uniform")[0], y)
+    np.testing.assert_array_equal(run(PROTOCOL, x, "uniform", key=key)[0], y)
 
 
 def failed_all(kind: str, t: int) -> tuple[np.ndarray, np.ndarray]:
@@ -188,7 +192,7 @@ def test_gain_and_clip() -> None:
 @pytest.mark.parametrize("kind", ["drift", "gaussian"])
 def test_severity_is_the_way_from_clean_to_failed(kind: str) -> None:
     x, key = windows(32), jax.random.key(9)
-    run = jax.jit(lambda s: apply_failure(key, x, ALL, kind, severity=s))
+    run = jax.jit(lambda s: apply_failure(x, ALL, kind, key=key, severity=s))
     full = np.asarray(failed(32)[kind][1])
     np.testing.assert_array_equal(run(jnp.float32(0.0)), x)
     np.testing.assert_allclose(run(jnp.float32(1.0)), full, atol=1e-6)
@@ -201,11 +205,11 @@ def test_one_trace_and_vmap_equals_loop() -> None:
 
     @chex.assert_max_traces(n=1)
     def step(key: jax.Array, x: jax.Array) -> tuple[jax.Array, jax.Array]:
-        return corrupt(key, x, protocol, "uniform")
+        return corrupt(protocol, x, "uniform", key=key)
 
     one = jax.jit(step)
     loop = [one(key, x) for key in keys]
-    many = jax.jit(jax.vmap(lambda key: corrupt(key, x, protocol, "uniform")))(keys)
+    many = jax.jit(jax.vmap(lambda key: corrupt(protocol, x, "uniform", key=key)))(keys)
     np.testing.assert_array_equal(many[0], np.stack([y for y, _ in loop]))
     np.testing.assert_array_equal(many[1], np.stack([m for _, m in loop]))
     assert hash(protocol) == hash(random_failing(NAMES, n_clean=1))
@@ -214,25 +218,28 @@ def test_one_trace_and_vmap_equals_loop() -> None:
 @pytest.mark.parametrize(
     ("make", "expected"),
     [
-        (lambda: random_failing(NAMES, 5), r"n_clean is 5, expected 0..4"),
-        (lambda: random_failing(NAMES, -1), r"n_clean is -1"),
-        (lambda: random_failing(NAMES, 1, clean_fraction=1.2), r"clean_fraction is 1.2"),
-        (lambda: fixed_failing(NAMES, ["a", "x"]), r"\['x'\]: expected one or more of \['a', 'b'"),
+        (lambda: random_failing(NAMES, 5), r"n_clean=5: expected a whole number 0..4.*no_failure"),
+        (lambda: random_failing(NAMES, -1), r"n_clean=-1"),
+        (lambda: random_failing(NAMES, 1, clean_fraction=1.2), r"clean_fraction=1.2"),
+        (lambda: fixed_failing(NAMES, ["a", "x"]), r"failing='x': expected one of 'a', 'b'"),
         (lambda: fixed_failing(NAMES, []), r"expected one or more of"),
-        (lambda: fixed_failing(NAMES, ["a", "a"]), r"expected different indices"),
-        (lambda: generalisation(NAMES, (1, 2), (3, 6)), r"test range \(3, 6\): expected 1 <= low"),
-        (lambda: generalisation(NAMES, (0, 2), (3, 5)), r"train range \(0, 2\)"),
-        (lambda: Protocol(0, 0, 0), r"n_channels is 0"),
-        (lambda: Protocol(3, 2, 1), r"failing channels from 2 to 1"),
-        (lambda: Protocol(3, 1, 1, (3,)), r"expected different indices in 0..2"),
+        (lambda: fixed_failing(NAMES, ["a", "a"]), r"expected different channels"),
+        (
+            lambda: generalisation(NAMES, (1, 2), (3, 6)),
+            r"test\[1\]=6: expected a whole number 3..5",
+        ),
+        (lambda: generalisation(NAMES, (0, 2), (3, 5)), r"train\[0\]=0"),
+        (lambda: Protocol(0, 0, 0), r"n_channels=0"),
+        (lambda: Protocol(3, 2, 1), r"high=1: expected a whole number 2..3"),
+        (lambda: Protocol(3, 1, 1, (3,)), r"failing\[0\]=3: expected a whole number 0..2"),
         (lambda: Protocol(3, 1, 2, (0, 1)), r"use fixed_failing"),
         (
-            lambda: corrupt(jax.random.key(0), windows(1), no_failure("abc"), "zero"),
-            r"has 5 channels",
+            lambda: corrupt(no_failure("abc"), windows(1), "zero", key=jax.random.key(0)),
+            r"x.shape=\(240, 5, 1\): expected \[N, 3, T\]",
         ),
         (
-            lambda: corrupt(jax.random.key(0), windows(1), no_failure(NAMES), "noise"),
-            r"'noise' is unknown, expected one of \['uniform', 'gaussian'",
+            lambda: corrupt(no_failure(NAMES), windows(1), "noise", key=jax.random.key(0)),
+            r"kind='noise': expected one of 'uniform', 'gaussian'",
         ),
     ],
 )

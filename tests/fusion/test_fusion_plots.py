@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 from matplotlib.figure import Figure
 
-from fusion.plots import plot_channel_weights, plot_confusion, plot_gate, plot_training
+from fusion.plots import plot_cases, plot_channel_weights, plot_confusion, plot_gate, plot_training
 
 NAMES = ("ear", "eye", "nose")
 RNG = np.random.default_rng(0)
@@ -31,6 +31,17 @@ def test_confusion_shows_counts_and_accuracy(tmp_path: Path) -> None:
     np.testing.assert_allclose(axes.images[0].get_array()[0], [0.8, 0.2, 0.0])
     with pytest.raises(ValueError, match=r"shape \(2, 2\), expected \(3, 3\)"):
         plot_confusion(np.eye(2), NAMES)
+
+
+def test_cases_show_accuracy_source_and_ceiling(tmp_path: Path) -> None:
+    cases = {"all work": (97.5, 96.7, None), "some fail": (90.0, None, 95.0)}
+    axes = saved(plot_cases(cases), tmp_path).axes[0]
+    assert [bar.get_width() for bar in axes.patches] == [97.5, 90.0]
+    marks = {line.get_label(): line.get_xdata()[0] for line in axes.lines}
+    assert marks == {"source": 96.7, "best possible": 95.0}
+    assert [label.get_text() for label in axes.get_yticklabels()] == list(cases)
+    with pytest.raises(ValueError, match="expected at least one case"):
+        plot_cases({})
 
 
 def test_gate_shows_medians_of_corrupted_examples(tmp_path: Path) -> None:

@@ -74,7 +74,7 @@ def test_oracle_shares_its_weight_among_the_healthy() -> None:
 
 def test_modality_dropout_drops_whole_sensors_never_all() -> None:
     features = jnp.ones((3, 4000, 2))
-    dropped = np.asarray(drop_modalities(jax.random.key(0), features, 0.6))
+    dropped = np.asarray(drop_modalities(features, 0.6, key=jax.random.key(0)))
     kept = dropped[:, :, 0] > 0
     assert kept.any(axis=0).all()
     np.testing.assert_array_equal(dropped[:, :, 0], dropped[:, :, 1])
@@ -86,7 +86,7 @@ def test_modality_dropout_drops_whole_sensors_never_all() -> None:
 def test_embrace_takes_each_feature_from_one_available_sensor() -> None:
     features = jnp.arange(3.0)[:, None, None] * jnp.ones((3, 500, 8))
     keep = jnp.asarray([[1.0, 0.0, 1.0]]) * jnp.ones((500, 1))
-    drawn = np.asarray(embrace(features, jax.random.key(0), keep))
+    drawn = np.asarray(embrace(features, keep, key=jax.random.key(0)))
     assert set(np.unique(drawn)) == {0.0, 2.0}
     np.testing.assert_allclose(drawn.mean(), 1.0, atol=0.06)
-    np.testing.assert_allclose(embrace(features, None, keep), 1.0)
+    np.testing.assert_allclose(embrace(features, keep), 1.0)

@@ -7,7 +7,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.losses import LossConfig, LossParams, argate_loss, cross_entropy, loss_targets
+from fusion.losses import (
+    LossConfig,
+    LossParams,
+    argate_loss,
+    cross_entropy,
+    gate_penalty,
+    loss_targets,
+)
 from fusion.targets import (
     TargetConfig,
     apply_targets,
@@ -45,7 +52,7 @@ def test_printed_loss_equals_the_equation() -> None:
         + 0.7 * (W * losses).sum(1).mean()
         + 2.5 * ((W - target) ** 2).sum(1).mean()
     )
-    config = LossConfig(learned_targets=False, normalizer="softmax_sigmoid", label_smoothing=0.0)
+    config = LossConfig(learned_targets=False, fixed_targets="softmax_sigmoid", label_smoothing=0.0)
     labels = jnp.broadcast_to(jnp.asarray(LABELS)[:, None], (5, 9))
     aux = cross_entropy(jnp.asarray(AUX), labels)
     terms = argate_loss(
@@ -77,9 +84,8 @@ def test_learned_targets_replace_the_fixed_ones() -> None:
 def test_targets_from_other_losses_in_the_examples_that_count() -> None:
     other, counted = _aux_losses()[::-1].copy(), np.array([1.0, 0, 1, 1, 0], np.float32)
     config = LossConfig(learned_targets=False, label_smoothing=0.0, uniform_floor=1.0)
-    terms = argate_loss(
-        config, LossParams(1.0, 1.0, 0.5), jnp.asarray(LOGITS), jnp.asarray(LABELS),
-        jnp.asarray(W), jnp.asarray(_aux_losses(), jnp.float32),
+    terms = gate_penalty(
+        config, LossParams(1.0, 1.0, 0.5), jnp.asarray(W), jnp.asarray(_aux_losses(), jnp.float32),
         target_losses=jnp.asarray(other, jnp.float32), counted=jnp.asarray(counted),
     )  # fmt: skip
     squares = ((W - _softmax(-other / 0.5)) ** 2).sum(1)
@@ -138,9 +144,9 @@ def test_regularization_reaches_auxiliary_losses_only_when_asked() -> None:
 
 
 def test_combinations_that_mean_nothing_are_refused() -> None:
-    with pytest.raises(ValueError, match="need auxiliary=True"):
+    with pytest.raises(ValueError, match="expected auxiliary=True with it"):
         LossConfig(auxiliary=False)
-    with pytest.raises(ValueError, match="needs regularization=True"):
+    with pytest.raises(ValueError, match="expected regularization=True with it"):
         LossConfig(regularization=False)
     with pytest.raises(ValueError, match=r"uniform_floor=1\.5"):
         LossConfig(uniform_floor=1.5)
@@ -153,12 +159,13 @@ def test_targets_fall_with_the_own_loss_whatever_the_parameters() -> None:
         lambda p: p + jax.random.normal(jax.random.key(1), p.shape, p.dtype), params
     )
     assert check_targets(config, noise) > 0
-    projected = project_targets(config, noise)
+    projected = jax.jit(project_targets, static_argnums=0)(config, noise)
+    apply = jax.jit(apply_targets, static_argnums=0)
     assert check_targets(config, projected) == 0
     others = jax.random.uniform(jax.random.key(2), (16, 4), maxval=4.0)
     grid = jnp.linspace(0.0, 5.0, 21)
     for k in range(4):
         losses = jnp.broadcast_to(others[:, None], (16, 21, 4)).at[:, :, k].set(grid)
-        targets = apply_targets(config, projected, losses.reshape(-1, 4)).reshape(16, 21, 4)
+        targets = apply(config, projected, losses.reshape(-1, 4)).reshape(16, 21, 4)
         assert jnp.all(jnp.diff(targets[:, :, k], axis=1) <= 1e-6)
     assert jnp.all((targets >= 0) & (targets <= 1))

@@ -11,6 +11,7 @@ import numpy as np
 import pytest
 
 from fusion.encoders import EncoderConfig
+from fusion.losses import LossConfig
 from fusion.models import (
     MODELS,
     ModelConfig,
@@ -18,7 +19,6 @@ from fusion.models import (
     count_parameters,
     export,
     init,
-    loss_config,
     match_parameters,
     predict,
 )
@@ -53,7 +53,7 @@ def test_all_models_match_within_two_percent(reference: ModelConfig) -> None:
 
 def test_matching_says_when_it_cannot() -> None:
     huge = dataclasses.replace(SMALL, model="baseline", encoder=EncoderConfig(features=200))
-    with pytest.raises(ValueError, match="not within 2 %"):
+    with pytest.raises(ValueError, match="parameters within 2 %"):
         match_parameters(huge, SMALL)
 
 
@@ -63,22 +63,22 @@ def test_export_gives_the_same_logits_to_the_bit(name: str) -> None:
     config = dataclasses.replace(SMALL, model=name)
     params = init(jax.random.key(0), config)
     recipe = MODELS[name]
-    assert set(params) == {"main"} | ({"aux"} if recipe.auxiliary else set()) | (
-        {"targets"} if recipe.learned_targets else set()
+    assert set(params) == {"main"} | ({"aux"} if recipe.loss.auxiliary else set()) | (
+        {"targets"} if recipe.loss.learned_targets else set()
     )
 
     @jax.jit
     @chex.assert_max_traces(n=1)
     def in_training(params: dict) -> jax.Array:
-        out = predict(params["main"], config, X, FAILED)
-        if recipe.auxiliary:
-            assert auxiliary_logits(params, config, X, out.features).shape == (7, 3, 4)
+        out = predict(config, params["main"], X, FAILED)
+        if recipe.loss.auxiliary:
+            assert auxiliary_logits(config, params, X, out.features).shape == (7, 3, 4)
         return out.logits
 
     main = export(params)
     names = {jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(main)}
     assert not any("aux" in n or "lattice" in n for n in names)
-    exported = jax.jit(lambda main: predict(main, config, X, FAILED).logits)(main)
+    exported = jax.jit(lambda main: predict(config, main, X, FAILED).logits)(main)
     np.testing.assert_array_equal(exported, in_training(params))
 
 
@@ -88,32 +88,33 @@ def test_without_weight_sharing_the_auxiliary_paths_have_encoders_of_their_own()
     shared = dataclasses.replace(config, weight_sharing=True)
     assert "encoder" in params["aux"]
     assert count_parameters(config)["aux"] > count_parameters(shared)["aux"]
-    features = predict(export(params), config, X).features
+    features = predict(config, export(params), X).features
     moved = jax.tree.map(lambda p: p + 1.0, params["main"])
-    unchanged = auxiliary_logits(params | {"main": moved}, config, X, features)
-    np.testing.assert_array_equal(auxiliary_logits(params, config, X, features), unchanged)
+    unchanged = auxiliary_logits(config, params | {"main": moved}, X, features)
+    np.testing.assert_array_equal(auxiliary_logits(config, params, X, features), unchanged)
 
 
 def test_ablations_reach_the_loss() -> None:
-    config = dataclasses.replace(SMALL, model="argate_l", learned_targets=False)
+    config = dataclasses.replace(SMALL, model="argate_l", loss=LossConfig(learned_targets=False))
     assert "targets" not in init(jax.random.key(0), config)
-    assert loss_config(config).regularization and not loss_config(config).learned_targets
-    off = dataclasses.replace(config, regularization=False, loss_weighting=False)
-    assert loss_config(off) == loss_config(dataclasses.replace(SMALL, model="argate_ws"))
+    assert config.recipe.loss == MODELS["argate_plus"].loss
+    assert dataclasses.replace(config, loss=None).recipe == MODELS["argate_l"]
+    with pytest.raises(ValueError, match=r"loss.loss_weighting=True: expected a model with a"):
+        dataclasses.replace(SMALL, model="baseline", loss=LossConfig())
 
 
 def test_oracle_needs_the_mask_and_uses_it() -> None:
     config = dataclasses.replace(SMALL, model="oracle")
     params = init(jax.random.key(0), config)
-    with pytest.raises(ValueError, match="oracle gate needs `failed`"):
-        predict(export(params), config, X)
-    a = predict(export(params), config, X, FAILED).logits
-    b = predict(export(params), config, X.at[:, 0].set(0.7), FAILED).logits
+    with pytest.raises(ValueError, match="failed=None: expected the mask"):
+        predict(config, export(params), X)
+    a = predict(config, export(params), X, FAILED).logits
+    b = predict(config, export(params), X.at[:, 0].set(0.7), FAILED).logits
     np.testing.assert_array_equal(a, b)
 
 
 def test_bad_configs_name_the_value_and_the_known_ones() -> None:
-    with pytest.raises(ValueError, match="model='argate' is not known; known: baseline, netgated"):
+    with pytest.raises(ValueError, match="model='argate': expected one of 'baseline', 'netgated'"):
         ModelConfig(model="argate")
     with pytest.raises(ValueError, match=r"dropout=1\.0"):
         ModelConfig(dropout=1.0)

@@ -16,11 +16,11 @@ from fusion.encoders import EncoderConfig
 from fusion.evaluate import gate_auroc, split_accuracy
 from fusion.failures import no_failure, random_failing
 from fusion.loop import Corruption, TrainingDiverged, fit, test_output
-from fusion.losses import LossParams
+from fusion.losses import LossConfig, LossParams
 from fusion.models import ModelConfig, export
 from fusion.presets import preset
 from fusion.targets import check_targets
-from fusion.train import HyperParams, TrainConfig, evaluate, make_epoch, make_train
+from fusion.train import HyperParams, TrainConfig, make_epoch, make_train, predict_batches
 
 # optax's Adam raises a float to an integer power, which strict promotion forbids.
 pytestmark = pytest.mark.relaxed
@@ -35,8 +35,9 @@ MODEL = ModelConfig(
     gate_width=8,
     head_widths=(16,),
     dropout=0.1,
+    loss=LossConfig(uniform_floor=1.0, label_smoothing=0.0),
 )
-TRAIN = TrainConfig(epochs=6, batch_size=64, uniform_floor=1.0, label_smoothing=0.0)
+TRAIN = TrainConfig(epochs=6, batch_size=64)
 HYPER = HyperParams(1e-2, 1e-4, LossParams(1.0, 3.0, 0.5, 0.3))
 ONE_CLEAN = random_failing(CHANNELS, 1)
 NOISE = Corruption(ONE_CLEAN, ONE_CLEAN)
@@ -63,11 +64,11 @@ def _same(a: object, b: object) -> None:
 
 @pytest.fixture(scope="module")
 def trained() -> object:
-    return fit(jax.random.key(0), DATA, MODEL, TRAIN, HYPER, NOISE)
+    return fit(MODEL, TRAIN, HYPER, DATA, NOISE, key=jax.random.key(0))
 
 
 def test_learns_to_find_the_one_healthy_sensor(trained: object) -> None:
-    output = test_output(jax.random.key(0), trained.state, DATA, MODEL, NOISE)
+    output = test_output(MODEL, trained.state, DATA, NOISE, key=jax.random.key(0))
     parts = split_accuracy(output.labels, output.logits.argmax(-1), output.failed)
     assert parts.clean > 0.97
     assert parts.corrupted > 0.9  # by chance alone one in three
@@ -84,23 +85,57 @@ def test_resume_gives_the_same_bits(trained: object, tmp_path: Path) -> None:
         if epoch == 2:
             raise Killed
 
-    arguments = (jax.random.key(0), DATA, MODEL, TRAIN, HYPER, NOISE)
+    arguments, key = (MODEL, TRAIN, HYPER, DATA, NOISE), jax.random.key(0)
     with pytest.raises(Killed):
-        fit(*arguments, checkpoint_dir=tmp_path / "c", on_epoch=kill)
-    with pytest.raises(ValueError, match="holds checkpoints of another run"):
-        fit(*arguments, checkpoint_dir=tmp_path / "c")
-    resumed = fit(*arguments, checkpoint_dir=tmp_path / "c", resume=True)
+        fit(*arguments, key=key, checkpoint_dir=tmp_path / "c", on_epoch=kill)
+    with pytest.raises(ValueError, match="expected a folder without checkpoints"):
+        fit(*arguments, key=key, checkpoint_dir=tmp_path / "c")
+    resumed = fit(*arguments, key=key, checkpoint_dir=tmp_path / "c", resume=True)
     _same(resumed.state, trained.state)
     assert resumed.history == trained.history
+    other = {"key": key, "checkpoint_dir": tmp_path / "c", "resume": True}
+    longer = dataclasses.replace(TRAIN, epochs=9)
+    with pytest.raises(ValueError, match=r"resume=True: expected .* \(train.epochs: 6 -> 9\)"):
+        fit(MODEL, longer, HYPER, DATA, NOISE, **other)
+    with pytest.raises(ValueError, match=r"hyper.loss.beta: 3.0 -> 2.0\)"):
+        softer = HYPER._replace(loss=HYPER.loss._replace(beta=2.0))
+        fit(MODEL, TRAIN, softer, DATA, NOISE, **other)
+    with pytest.raises(ValueError, match=r"\(key: 'array"):
+        fit(*arguments, **(other | {"key": jax.random.key(1)}))
+
+
+def test_a_checkpoint_is_due_by_the_clock_too(tmp_path: Path) -> None:
+    class Killed(Exception):
+        pass
+
+    def kill(epoch: int, row: dict[str, float]) -> None:
+        # A kill of the process, which runs no `finally`: look at what is on the disk already.
+        if epoch == 2:
+            assert [p.name for p in (tmp_path / "c").iterdir()] == ["1"]
+            raise Killed
+
+    short = dataclasses.replace(TRAIN, epochs=3)
+    with pytest.raises(Killed):
+        fit(
+            MODEL,
+            short,
+            HYPER,
+            DATA,
+            NOISE,
+            key=jax.random.key(0),
+            checkpoint_dir=tmp_path / "c",
+            checkpoint_minutes=0.0,
+            on_epoch=kill,
+        )
 
 
 def test_non_finite_loss_stops_and_keeps_the_last_good_state(tmp_path: Path) -> None:
-    hyper = HYPER._replace(loss=HYPER.loss._replace(alpha=float("nan")))
-    arguments = (jax.random.key(0), DATA, MODEL, TRAIN)
+    hyper = HYPER._replace(loss=HYPER.loss._replace(alpha=jnp.float32("nan")))
+    rest = {"key": jax.random.key(0), "checkpoint_dir": tmp_path / "c"}
     with pytest.raises(TrainingDiverged, match=r"epoch 1 is nan.*Lower the learning rate"):
-        fit(*arguments, hyper, NOISE, checkpoint_dir=tmp_path / "c")
+        fit(MODEL, TRAIN, hyper, DATA, NOISE, **rest)
     # No epoch was good, so no checkpoint stands in the way of a better run.
-    fit(*arguments, HYPER, NOISE, checkpoint_dir=tmp_path / "c")
+    fit(MODEL, TRAIN, HYPER, DATA, NOISE, **rest)
 
 
 def test_whole_run_vmaps_over_seeds_and_hyper_parameters(trained: object) -> None:
@@ -109,7 +144,8 @@ def test_whole_run_vmaps_over_seeds_and_hyper_parameters(trained: object) -> Non
     hyper = jax.tree.map(lambda v: jnp.full(2, v, jnp.float32), HYPER)
     hyper = hyper._replace(learning_rate=jnp.asarray([1e-2, 1e-3], jnp.float32))
     keys = jax.vmap(jax.random.key)(jnp.asarray([0, 1]))
-    _, metrics = jax.jit(jax.vmap(train, (0, 0, None, None)))(keys, hyper, x, y)
+    run = jax.vmap(lambda hyper, key: train(hyper, x, y, key=key))
+    _, metrics = jax.jit(run)(hyper, keys)
     assert metrics.accuracy.shape == (2, TRAIN.epochs)
     # The first trial is the run of `fit` with the same key and settings.
     expected = [row["total"] for row in trained.history]
@@ -119,27 +155,31 @@ def test_whole_run_vmaps_over_seeds_and_hyper_parameters(trained: object) -> Non
 
 def test_evaluation_does_not_depend_on_the_chunk(trained: object) -> None:
     main, x = export(trained.state.params), jnp.asarray(DATA.test_x[:70])
-    whole = evaluate(main, MODEL, x, batch_size=70)
-    parts = evaluate(main, MODEL, x, batch_size=32)
+    whole = predict_batches(MODEL, main, x, batch_size=70)
+    parts = predict_batches(MODEL, main, x, batch_size=32)
     jax.tree.map(lambda a, b: np.testing.assert_allclose(a, b, atol=1e-5), whole, parts)
 
 
 def test_models_of_a_seed_see_the_same_corruption(trained: object) -> None:
     key = jax.random.key(5)
-    baseline = dataclasses.replace(MODEL, model="baseline")
-    other = fit(key, DATA, baseline, dataclasses.replace(TRAIN, epochs=1), HYPER, NOISE)
-    a = test_output(key, trained.state, DATA, MODEL, NOISE)
-    b = test_output(key, other.state, DATA, baseline, NOISE)
+    baseline = dataclasses.replace(MODEL, model="baseline", loss=None)
+    other = fit(baseline, dataclasses.replace(TRAIN, epochs=1), HYPER, DATA, NOISE, key=key)
+    a = test_output(MODEL, trained.state, DATA, NOISE, key=key)
+    b = test_output(baseline, other.state, DATA, NOISE, key=key)
     np.testing.assert_array_equal(a.failed, b.failed)
 
 
 def test_bad_sizes_are_refused_before_any_compile() -> None:
-    with pytest.raises(ValueError, match="10 training examples fill no batch of 64"):
+    with pytest.raises(ValueError, match="batch_size=64: expected at most 10"):
         make_epoch(MODEL, TRAIN, 10)
     with pytest.raises(ValueError, match="epochs=0"):
         TrainConfig(epochs=0)
-    wrong = dataclasses.replace(MODEL, n_sensors=5)
-    with pytest.raises(ValueError, match="build the ModelConfig from the data set"):
-        fit(jax.random.key(0), DATA, wrong, TRAIN, HYPER, Corruption(*[no_failure(CHANNELS)] * 2))
-    with pytest.raises(ValueError, match="no preset for the data set 'copies'"):
+    wrong, key = dataclasses.replace(MODEL, n_classes=5), jax.random.key(0)
+    clean = Corruption(*[no_failure(CHANNELS)] * 2)
+    with pytest.raises(ValueError, match=r"n_classes=5: expected 3.*build the ModelConfig"):
+        fit(wrong, TRAIN, HYPER, DATA, clean, key=key)
+    other = Corruption(*[no_failure("abcde")] * 2)
+    with pytest.raises(ValueError, match=r"noise.train.n_channels=5: expected 4"):
+        fit(MODEL, TRAIN, HYPER, DATA, other, key=key)
+    with pytest.raises(ValueError, match=r"dataset.name='copies': expected one of har"):
         preset(DATA)

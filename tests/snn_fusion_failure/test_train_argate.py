@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import re
 from pathlib import Path
 from typing import Any
 
@@ -11,10 +12,11 @@ import pytest
 
 from fusion.data import load
 from snn_fusion_failure.commands import train_argate
-from snn_fusion_failure.commands.train_argate import Config
+from snn_fusion_failure.commands.argate_report import printed
+from snn_fusion_failure.commands.argate_runs import Config, build_cases, build_settings
 from snn_fusion_failure.records import fusion_tables
 from snn_fusion_failure.records.fusion_tables import Row, Run
-from snn_fusion_failure.runs import repository, write_json
+from snn_fusion_failure.runs import append_metrics, repository, write_json
 from tests._scripts import load_script
 
 reproduce = load_script("studies/reproduce")
@@ -23,7 +25,7 @@ study_argate = load_script("studies/study_argate")
 # optax's Adam raises a float to an integer power, which strict promotion forbids.
 pytestmark = pytest.mark.relaxed
 
-SMALL = Config(dataset="simulated", model="argate_l", epochs=2)
+SMALL = Config(dataset="simulated", preset="quick", protocol="random", n_clean=1, epochs=2)
 
 
 @pytest.fixture(scope="module")
@@ -71,13 +73,20 @@ def test_a_run_folder_is_not_written_twice(run: tuple[Config, dict[str, Any]]) -
 @pytest.mark.parametrize(
     ("change", "message"),
     [
-        ({"dataset": "kitty"}, r"'kitty' is unknown, expected one of .*'simulated'"),
-        ({"model": "argate"}, r"'argate' is not known; known: baseline, netgated"),
-        ({"kind": "fog"}, r"'fog' is unknown, expected one of uniform, gaussian"),
-        ({"preset": "best"}, r"'best' is not known; known: quick, paper"),
+        ({"dataset": "kitty"}, r"name='kitty': expected one of .*'simulated'"),
+        ({"model": "argate"}, r"model='argate': expected one of 'baseline', 'netgated'"),
+        ({"kind": "fog"}, r"kind='fog': expected one of 'uniform', 'gaussian'"),
+        ({"preset": "best"}, r"preset='best': expected one of 'quick', 'paper'"),
         ({"n_clean": 7}, r"n_clean.*7"),
-        ({"protocol": "generalisation", "test_range": (3, 8)}, r"\(3, 8\)|8"),
-        ({"epochs": 0}, r"epochs=0: expected at least 1"),
+        (
+            {"protocol": "generalisation", "n_clean": None, "test_range": (3, 8)},
+            r"test\[1\]=8: expected a whole number 3..6",
+        ),
+        ({"test_range": (3, 5)}, r"test_range=\(3, 5\): expected --protocol generalisation"),
+        ({"protocol": "clean"}, r"n_clean=1: expected --protocol random or fixed"),
+        ({"epochs": 0}, r"epochs=0: expected a whole number"),
+        ({"beta": -1.0}, r"beta=-1.0: expected a number >= 0"),
+        ({"changes": ("model.loss.uniform_flor=0",)}, r"did you mean uniform_floor\?"),
     ],
 )
 def test_bad_settings_are_refused_before_a_folder_is_made(
@@ -104,13 +113,68 @@ def test_options_reach_the_settings() -> None:
         test_range=(3, 5),
         kind="gaussian",
         redraw=False,
+        changes=("model.loss.uniform_floor=0.5", "train.batch_size=16"),
     )
-    settings, corruption = train_argate.build(config, data)
+    settings = build_settings(config, data)
+    (case,) = build_cases(config, data).values()
+    corruption = case.noise
     assert settings.model.normalizer == "softmax_sigmoid"
+    assert settings.model.loss.fixed_targets == "softmax_sigmoid"
+    assert (settings.model.loss.uniform_floor, settings.train.batch_size) == (0.5, 16)
     assert (settings.train.epochs, settings.hyper.learning_rate) == (3, 0.1)
     assert settings.hyper.loss[:3] == (0.2, 0.3, 0.4)
     assert (corruption.kind, corruption.redraw) == ("gaussian", False)
     assert corruption.train != corruption.test
+
+
+def test_without_options_clean_and_failing_cases_stand_side_by_side(
+    tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    config = Config(dataset="simulated", epochs=1, out=tmp_path / "run")
+    assert (config.preset, config.protocol) == ("paper", None)
+    summary = train_argate.main(config)
+    text = capsys.readouterr().out.splitlines()
+    assert text[0].split() == ["accuracy", "%", "ceiling", "%"]
+    assert [re.split(r"\s{2,}", line.strip())[0] for line in text[1:5]] == [
+        "all sensors work",
+        "3 of 6 sensors fail",
+        "examples without a failed sensor",
+        "examples with failed sensors",
+    ]
+    assert text[5].startswith("2 networks (argate_l, preset paper, 1 epochs, seed 0) learned from")
+    assert re.fullmatch(
+        r"result: dataset=simulated model=argate_l clean=[\d.]+ random=[\d.]+", text[-1]
+    )
+    assert summary["cases"]["clean"]["ceiling"] > summary["cases"]["random"]["ceiling"]
+    assert {"cases.png", "confusion_clean.png", "gate_random.png"} <= {
+        path.name for path in config.out.iterdir()
+    }
+
+
+def test_the_printed_accuracy_stands_beside_the_same_case_only() -> None:
+    config = Config(dataset="har", model="argate_plus")
+    data = dataclasses.replace(
+        load("simulated"), name="har", channels=tuple("abcdefghi"), split="subject"
+    )
+
+    def sources(**changes: Any) -> list[float | None]:
+        other = dataclasses.replace(config, **changes)
+        return [printed(other, case.noise) for case in build_cases(other, data).values()]
+
+    assert sources() == [95.69, 87.68]
+    assert sources(kind="gaussian", n_clean=1) == [95.69, 73.19]
+    assert sources(n_clean=2) == [95.69, None]
+    assert sources(protocol="generalisation") == [77.1]
+    assert sources(model="oracle") == [None, None]
+
+
+def test_a_resumed_run_has_each_epoch_once(tmp_path: Path) -> None:
+    for epoch in (1, 2, 3):
+        append_metrics(tmp_path, {"case": "random", "epoch": epoch})
+    append_metrics(tmp_path, {"case": "clean", "epoch": 3})
+    train_argate.forget_from(tmp_path, "random", 2)
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["epoch"] for line in lines] == [1, 3]
 
 
 TINY = {
@@ -119,7 +183,7 @@ TINY = {
         (
             Row(
                 "n_clean=1 uniform",
-                {"dataset": "simulated", "n_clean": 1, "epochs": 2},
+                {"dataset": "simulated", "protocol": "random", "n_clean": 1, "epochs": 2},
                 channel="sensor_2",
             ),
         ),
@@ -130,7 +194,7 @@ TINY = {
 def test_reproduce_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    monkeypatch.setattr(_fusion_tables, "TABLES", TINY)
+    monkeypatch.setattr(fusion_tables, "TABLES", TINY)
     config = reproduce.Config(
         table=("3.1",),
         preset="quick",
@@ -208,7 +272,8 @@ def test_the_study_changes_one_setting_at_a_time(tmp_path: Path) -> None:
     listed = study_argate.variants(study_argate.Config())
     assert len(listed) <= 24
     assert len({v.path(tmp_path) for v in listed}) == len(listed)
-    base = train_argate.build(Config(dataset="simulated"), load("simulated"))
+    data, config = load("simulated"), dataclasses.replace(SMALL, epochs=None)
+    base = build_settings(config, data), build_cases(config, data)["random"].noise
     assert study_argate.change(*base, {}) == base
     for variant in listed:
         # Every change changes something, and can be built.

@@ -19,7 +19,6 @@ what the targets see (`DetectorConfig.auxiliary_second`, `balanced_paths`).
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any, NamedTuple
 
@@ -34,7 +33,7 @@ from fusion.detection.learning.detection_loss import (
     regression_loss,
 )
 from fusion.detection.learning.sampling import Sample
-from fusion.losses import LossParams, argate_loss
+from fusion.losses import LossParams, gate_penalty
 from fusion.targets import apply_targets
 
 __all__ = ["PathLosses", "class_losses", "gate_terms", "path_losses"]
@@ -105,7 +104,7 @@ def gate_terms(
         weights: `[b, k]` fusion weights.
         stages: losses of each stage.
     """
-    options = dataclasses.replace(config.gate_loss, normalizer=config.normalizer)
+    options = config.gate_loss
     aux_losses = sum((stage.whole for stage in stages[1:]), stages[0].whole)
     given, counted, tracking = aux_losses, None, jnp.zeros(())
     if config.balanced_paths:
@@ -119,8 +118,7 @@ def gate_terms(
     targets = None
     if options.learned_targets:
         targets = apply_targets(config.targets, params["targets"], given)
-    # The cross entropy of a single class is zero: what is left are the terms of the gate.
-    none = jnp.zeros((weights.shape[0], 1))
-    labels = jnp.zeros(weights.shape[0], jnp.int32)
-    terms = argate_loss(options, gate, none, labels, weights, aux_losses, targets, given, counted)
+    terms = gate_penalty(
+        options, gate, weights, aux_losses, targets, target_losses=given, counted=counted
+    )
     return terms.total + tracking, terms.auxiliary, terms.regularization

@@ -140,7 +140,7 @@ def detector_loss(
     drop4 = jax.random.fold_in(drop2, 1)
     main = params["main"]
     encoded, new_stats = encode(c, main, stats, inputs, train=True)
-    kept = drop_modalities(path_key, jnp.ones((2, b, 1)), c.path_drop)[:, :, 0].T
+    kept = drop_modalities(jnp.ones((2, b, 1)), c.path_drop, key=path_key)[:, :, 0].T
     scale = 2.0 * encoded.weights * kept
     truth = _safe_truth(inputs)
     truth_anchors = jax.vmap(lambda t: box3d_to_anchor(t, square=True))(truth)

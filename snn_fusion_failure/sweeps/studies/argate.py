@@ -17,7 +17,7 @@ from fusion import failures
 from fusion.data import load, validation_split
 from fusion.models import export
 from fusion.presets import preset as named_preset
-from fusion.train import evaluate, make_train
+from fusion.train import make_train, predict_batches
 from snn_fusion_failure.sweeps.study import Metric, Study
 
 __all__ = ["make"]
@@ -33,9 +33,6 @@ def make(
     split_seed: int = 0,
 ) -> Study:
     """A model on a data set (`$FUSION_DATA_DIR` for har and driver); `epochs=0`: the preset's."""
-    if kind not in failures.FAILURE_KINDS:
-        known = ", ".join(failures.FAILURE_KINDS)
-        raise ValueError(f"failure kind {kind!r} is unknown, expected one of {known}")
     data = validation_split(load(dataset), seed=split_seed)
     config, train_config, hyper = named_preset(data, model, preset)
     if epochs:
@@ -46,9 +43,9 @@ def make(
     score_x, score_y = jnp.asarray(data.test_x), jnp.asarray(data.test_y)
 
     def trial(params: Any, key: Any) -> dict[str, Any]:
-        state, metrics = train(key, params, train_x, train_y)
-        x, failed = failures.corrupt(jax.random.fold_in(key, 3), score_x, protocol, kind)
-        logits, _ = evaluate(export(state.params), config, x, failed)
+        state, metrics = train(params, train_x, train_y, key=key)
+        x, failed = failures.corrupt(protocol, score_x, kind, key=jax.random.fold_in(key, 3))
+        logits, _ = predict_batches(config, export(state.params), x, failed)
         hit = (jnp.argmax(logits, -1) == score_y).astype(jnp.float32)
         broken = jnp.any(failed, axis=1)
         loss = metrics.loss.total[-1]

@@ -1,0 +1,297 @@
+"""A trained network with all that its use needs: raw windows in, probabilities and warnings out."""
+
+from __future__ import annotations
+
+import dataclasses
+import functools
+import json
+import os
+import tempfile
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any, NamedTuple, get_type_hints
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Bool, Float, Key
+
+from fusion._checks import check_type
+from fusion.data.dataset import Dataset, Scale, apply_scale
+from fusion.loop import Corruption, test_output
+from fusion.models import ModelConfig, Params, check_windows, export, predict
+from fusion.monitor import MonitorParams, failure_probability, fit_monitor
+from fusion.train import TrainState
+
+__all__ = ["FittedARGate", "Prediction", "finish"]
+
+FORMAT = 1
+"""Version of the file that `FittedARGate.save` writes."""
+FAR = 0.5
+"""A reading farther outside the training range than this share of it is flagged."""
+
+
+class Prediction(NamedTuple):
+    """What a fitted network says about a batch of windows; arrays on the host.
+
+    Attributes:
+        probabilities: of the classes, `[batch, class]`, temperature scaled.
+        weights: fusion weights, `[batch, sensor]`; 0 for absent sensors.
+        failure_probability: that a sensor has failed, `[batch, sensor]`; 1 for absent sensors.
+        failed: sensors called failed at the stated false-alarm rate, and absent ones.
+        out_of_range: sensors with readings far outside their training range.
+    """
+
+    probabilities: Float[np.ndarray, "b c"]
+    weights: Float[np.ndarray, "b k"]
+    failure_probability: Float[np.ndarray, "b k"]
+    failed: Bool[np.ndarray, "b k"]
+    out_of_range: Bool[np.ndarray, "b k"]
+
+
+@functools.partial(jax.jit, static_argnums=0)
+def _run(
+    config: ModelConfig,
+    main: Params,
+    monitor: MonitorParams,
+    temperature: Float[Array, ""],
+    x: Float[Array, "b k t"],
+) -> tuple[Array, Array, Array]:
+    absent = jnp.any(jnp.isnan(x), axis=-1)
+    out = predict(config, main, x, absent)
+    calls = jnp.where(
+        absent, jnp.ones_like(out.weights), failure_probability(monitor, out.features)
+    )
+    return jax.nn.softmax(out.logits / temperature, axis=-1), out.weights, calls
+
+
+@dataclasses.dataclass(frozen=True, eq=False)
+class FittedARGate:
+    """A trained network, the scale and names of its sensors, and its calibration.
+
+    Attributes:
+        config: the network; params: of the main model (`fusion.export`).
+        scale: training range of every channel, in the units of the sensors.
+        channels, classes: names, in the order of the arrays.
+        monitor: tells failed sensors; false_alarm_rate: what its thresholds stand for.
+        temperature: logits are divided by it, so that probabilities are calibrated.
+    """
+
+    config: ModelConfig
+    params: Params
+    scale: Scale
+    channels: tuple[str, ...]
+    classes: tuple[str, ...]
+    monitor: MonitorParams
+    false_alarm_rate: float
+    temperature: float
+
+    def predict(
+        self,
+        x: Any,
+        *,
+        channels: Sequence[str] | None = None,
+        available: Any = None,
+    ) -> Prediction:
+        """Classify raw windows.
+
+        Args:
+            x: `[batch, sensor, time]` in the units of the training data; NaN in a window means
+                that the sensor sent nothing.
+            channels: names of the sensors of `x`, checked against those of training.
+            available: False for sensors that sent nothing, beside those with NaN.
+
+        Raises:
+            TypeError: `x` does not hold numbers.
+            ValueError: wrong shape, other channel names, infinite readings.
+        """
+        raw = np.asarray(x)
+        if raw.dtype.kind not in "fiu":
+            raise TypeError(f"x.dtype={raw.dtype}: expected numbers; convert the readings first")
+        if channels is not None and tuple(channels) != self.channels:
+            raise ValueError(
+                f"channels={list(channels)}: expected {list(self.channels)}; put the sensors in "
+                "this order"
+            )
+        check_windows(self.config, raw)
+        if np.isinf(raw).any():
+            window, sensor, _ = np.argwhere(np.isinf(raw))[0]
+            raise ValueError(
+                f"x[{window}, {sensor}]=window with infinity: expected finite readings of "
+                f"{self.channels[sensor]!r}; use NaN for readings that are missing"
+            )
+        absent = np.isnan(raw).any(axis=-1)
+        if available is not None:
+            if np.shape(available) != absent.shape:
+                raise ValueError(
+                    f"available.shape={np.shape(available)}: expected {absent.shape}; give one "
+                    "value for each sensor of each window"
+                )
+            absent |= ~np.asarray(available, bool)
+        scaled = apply_scale(raw, self.scale)
+        scaled = np.where(absent[:, :, None], np.float32(np.nan), scaled)
+        arrays = _run(self.config, self.params, self.monitor, jnp.float32(self.temperature), scaled)
+        probabilities, weights, calls = map(np.asarray, arrays)
+        margin = FAR * (self.scale.high - self.scale.low)
+        low, high = (self.scale.low - margin)[:, None], (self.scale.high + margin)[:, None]
+        far = ((raw < low) | (raw > high)).any(axis=-1) & ~absent
+        failed = absent | (calls > np.asarray(self.monitor.threshold))
+        return Prediction(probabilities, weights, calls, failed, far)
+
+    def save(self, path: str | Path) -> None:
+        """Write one `.npz` file without pickled objects; a reader sees the old file or the new."""
+        path = Path(path)
+        arrays = {f"params/{name}": value for name, value in _flatten(self.params).items()}
+        arrays |= {f"monitor/{n}": np.asarray(v) for n, v in self.monitor._asdict().items()}
+        arrays |= {"scale/low": self.scale.low, "scale/high": self.scale.high}
+        header = {
+            "format": FORMAT,
+            "config": dataclasses.asdict(self.config),
+            "channels": self.channels,
+            "classes": self.classes,
+            "false_alarm_rate": self.false_alarm_rate,
+            "temperature": self.temperature,
+        }
+        arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
+        path.parent.mkdir(parents=True, exist_ok=True)
+        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
+        try:
+            with os.fdopen(handle, "wb") as file:
+                np.savez(file, **arrays)
+            os.replace(temporary, path)
+        except BaseException:
+            Path(temporary).unlink(missing_ok=True)
+            raise
+
+    @classmethod
+    def load(cls, path: str | Path) -> FittedARGate:
+        """Read a file of `save`.
+
+        Raises:
+            FileNotFoundError: it is not there.
+            ValueError: it is no such file, or one of a later version.
+        """
+        with np.load(path, allow_pickle=False) as file:
+            if "header" not in file:
+                raise ValueError(
+                    f"path={str(path)!r}: expected a file of FittedARGate.save; check it"
+                )
+            held = {name: file[name] for name in file.files}
+        header = json.loads(held.pop("header").tobytes())
+        if header["format"] != FORMAT:
+            raise ValueError(
+                f"path={str(path)!r} of format {header['format']}: expected format {FORMAT}; "
+                "install the version that wrote it"
+            )
+        parts: dict[str, dict[str, np.ndarray]] = {"params": {}, "monitor": {}, "scale": {}}
+        for name, value in held.items():
+            part, _, rest = name.partition("/")
+            parts[part][rest] = value
+        return cls(
+            config=_build(ModelConfig, header["config"]),
+            params=_unflatten(parts["params"]),
+            scale=Scale(**parts["scale"]),
+            channels=tuple(header["channels"]),
+            classes=tuple(header["classes"]),
+            monitor=MonitorParams(**{n: jnp.asarray(v) for n, v in parts["monitor"].items()}),
+            false_alarm_rate=header["false_alarm_rate"],
+            temperature=header["temperature"],
+        )
+
+
+def _flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
+    if not isinstance(tree, dict):
+        return {prefix: np.asarray(tree)}
+    return {
+        name: value
+        for key, branch in tree.items()
+        for name, value in _flatten(branch, f"{prefix}/{key}" if prefix else key).items()
+    }
+
+
+def _unflatten(flat: dict[str, np.ndarray]) -> Params:
+    tree: dict[str, Any] = {}
+    for name, value in flat.items():
+        *path, last = name.split("/")
+        branch = tree
+        for key in path:
+            branch = branch.setdefault(key, {})
+        branch[last] = jnp.asarray(value)
+    return tree
+
+
+def _build(kind: Any, values: Any) -> Any:
+    """A frozen dataclass from the JSON of `dataclasses.asdict`; lists become tuples."""
+    if isinstance(values, list):
+        return tuple(_build(None, value) for value in values)
+    if not isinstance(values, dict):
+        return values
+    made = {}
+    for name, hint in get_type_hints(kind).items():
+        # `LossConfig | None` holds a LossConfig where the value is a mapping.
+        inner = (k for k in (hint, *getattr(hint, "__args__", ())) if dataclasses.is_dataclass(k))
+        made[name] = _build(next(inner, None), values[name])
+    return kind(**made)
+
+
+def _temperature(logits: Float[np.ndarray, "n c"], labels: np.ndarray) -> float:
+    r"""The T that minimizes the cross entropy of `softmax(logits / T)`; between 0.05 and 20.
+
+    Source: Guo et al. (2017).
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import log_softmax
+
+    rows = np.arange(len(labels))
+    logits = np.asarray(logits, np.float64)
+
+    def loss(log_t: float) -> float:
+        return -float(log_softmax(logits / np.exp(log_t), axis=1)[rows, labels].mean())
+
+    found = minimize_scalar(loss, bounds=(np.log(0.05), np.log(20.0)), method="bounded")
+    return float(np.exp(found.x))
+
+
+def finish(
+    model: ModelConfig,
+    state: TrainState,
+    data: Dataset,
+    noise: Corruption,
+    *,
+    key: Key[Array, ""],
+    false_alarm_rate: float = 0.01,
+) -> FittedARGate:
+    """Make a trained network ready for use: calibrate it on held-out rows.
+
+    Args:
+        model: as in `fit`.
+        state: trained.
+        data: its test rows calibrate, so give `validation_split(data)`, never the test rows that
+            will be reported on.
+        noise: the sensor failures that the probabilities are to be right under.
+        key: of the simulated failures.
+        false_alarm_rate: share of windows of a working sensor in which it is called failed.
+
+    Returns:
+        The network with temperature, and with a monitor trained on failures of every kind.
+    """
+    check_type("data", data, Dataset, "give validation_split(data)")
+    output = test_output(model, state, data, noise, key=key)
+    main = export(state.params)
+    monitor = fit_monitor(
+        model,
+        main,
+        jnp.asarray(data.test_x),
+        key=jax.random.fold_in(key, 5),
+        false_alarm_rate=false_alarm_rate,
+    )
+    return FittedARGate(
+        config=model,
+        params=jax.tree.map(jnp.asarray, main),
+        scale=data.scale,
+        channels=data.channels,
+        classes=data.classes,
+        monitor=monitor,
+        false_alarm_rate=false_alarm_rate,
+        temperature=_temperature(output.logits, output.labels),
+    )

@@ -1,0 +1,193 @@
+"""Options of `train_argate`, the cases that they ask for, and one trained and scored case."""
+
+from __future__ import annotations
+
+import dataclasses
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, Literal, NamedTuple
+
+import tyro
+
+from snn_fusion_failure.runs import apply_changes
+
+if TYPE_CHECKING:
+    from fusion.data import Dataset
+    from fusion.loop import Corruption, FitResult, TestOutput
+    from fusion.presets import Preset
+
+ProtocolName = Literal["clean", "random", "fixed", "generalisation"]
+N_CLEAN = {"har": 5, "driver": 8, "simulated": 3}
+"""Clean sensors of a corrupted example where none are given: about half of them."""
+RANGES = {"train_range": (1, 2), "test_range": (3, 8)}
+"""Fewest and most failing sensors where none are given (generalisation)."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train and score a sensor-fusion network."""
+
+    dataset: str = "har"
+    """har, driver or simulated."""
+    model: str = "argate_l"
+    """baseline, netgated, argate_ws, argate_plus, argate_l; or modality_dropout, embracenet,
+    oracle."""
+    preset: str = "paper"
+    """paper (the settings of record) or quick (few epochs)."""
+    protocol: ProtocolName | None = None
+    """Which sensors fail: none; drawn per example; the published fixed set; other counts in test
+    than in training. Left out: two networks, one for clean and one for random."""
+    n_clean: int | None = None
+    """Clean sensors of a corrupted example (random, fixed); about half when left out."""
+    train_range: tuple[int, int] | None = None
+    """Fewest and most failing sensors in training (generalisation); 1 2 when left out."""
+    test_range: tuple[int, int] | None = None
+    """Fewest and most failing sensors in test (generalisation); 3 8 when left out."""
+    kind: str = "uniform"
+    """Failure kind: uniform, gaussian, zero, stuck, drift, dropout, gain, clip."""
+    redraw: bool = True
+    """Draw the training noise anew in every epoch; --no-redraw draws it once (literal)."""
+    split: str | None = None
+    """How test rows are taken, e.g. trip for driver; the data set's default when left out."""
+    validation: bool = False
+    """Score on a held-out part of the training rows instead of the test rows."""
+    epochs: int | None = None
+    learning_rate: float | None = None
+    alpha: float | None = None
+    """Weight of the auxiliary losses (Equation 3.1)."""
+    beta: float | None = None
+    """Weight of the fusion-weight regularization (Equation 3.1)."""
+    tau: float | None = None
+    """Temperature of the fixed targets."""
+    normalizer: Literal["softmax", "softmax_sigmoid"] | None = None
+    """Of the fusion weights and of the fixed targets; softmax_sigmoid is the printed one."""
+    changes: Annotated[tuple[str, ...], tyro.conf.arg(name="set")] = ()
+    """Changed constants as part.name=value, parts model, train and hyper:
+    `model.loss.uniform_floor=0 hyper.weight_decay=1e-4`."""
+    seed: int = 0
+    data_dir: Path | None = None
+    """Folder of the data sets; $FUSION_DATA_DIR and the user cache are searched next."""
+    download: bool = False
+    """Fetch the data set from its publisher when it is nowhere."""
+    out: Path | None = None
+    """Run folder; runs/<dataset>_<model>_<protocol>_s<seed> when left out."""
+    resume: bool = False
+    """Go on with the run in the folder."""
+    overwrite: bool = False
+    """Replace the run in the folder."""
+
+
+class Case(NamedTuple):
+    """One training and its test.
+
+    Attributes:
+        title: which sensors fail, in words.
+        noise: the same as a corruption.
+    """
+
+    title: str
+    noise: Corruption
+
+
+def build_settings(config: Config, dataset: Dataset) -> Preset:
+    """Preset with the command line's changes, for a loaded data set."""
+    from fusion.presets import Preset, preset
+
+    parts: dict[str, Any] = preset(dataset, config.model, config.preset)._asdict()
+    named = {
+        "train.epochs": config.epochs,
+        "hyper.learning_rate": config.learning_rate,
+        "hyper.loss.alpha": config.alpha,
+        "hyper.loss.beta": config.beta,
+        "hyper.loss.tau": config.tau,
+        "model.normalizer": config.normalizer,
+        "model.loss.fixed_targets": config.normalizer,
+    }
+    given = [f"{name}={value}" for name, value in named.items() if value is not None]
+    return Preset(**apply_changes(parts, [*given, *config.changes]))
+
+
+def _protocols(config: Config, dataset: Dataset, name: ProtocolName) -> tuple[Any, Any, str]:
+    """Protocol in training and in test, and the case in words."""
+    from fusion import failures
+    from fusion.data import published_fixed
+
+    k = dataset.n_channels
+    if name == "clean":
+        protocol = failures.no_failure(dataset.channels)
+        return protocol, protocol, "all sensors work"
+    if name == "generalisation":
+        train, test = (getattr(config, n) or default for n, default in RANGES.items())
+        pair = failures.generalisation(dataset.channels, train, test)
+        return (
+            *pair,
+            f"{train[0]} to {train[1]} of {k} sensors fail in training, {test[0]} to {test[1]} in "
+            "test",
+        )
+    n_clean = config.n_clean
+    if n_clean is None:
+        n_clean = N_CLEAN.get(dataset.name, (k + 1) // 2) if name == "random" else 5
+    if name == "fixed":
+        protocol = published_fixed(dataset, n_clean)
+        return protocol, protocol, f"the same {k - n_clean} of {k} sensors fail"
+    protocol = failures.random_failing(dataset.channels, n_clean)
+    return protocol, protocol, f"{k - n_clean} of {k} sensors fail"
+
+
+def build_cases(config: Config, dataset: Dataset) -> dict[str, Case]:
+    """What is to be trained, by the name of the protocol.
+
+    Raises:
+        ValueError: an option that the protocol does not read.
+    """
+    from fusion.loop import Corruption
+
+    names: tuple[ProtocolName, ...] = (config.protocol,) if config.protocol else ("clean", "random")
+    if config.n_clean is not None and not {"random", "fixed"} & set(names):
+        raise ValueError(
+            f"n_clean={config.n_clean}: expected --protocol random or fixed with it; leave it out"
+        )
+    for option in RANGES:
+        if getattr(config, option) is not None and "generalisation" not in names:
+            raise ValueError(
+                f"{option}={getattr(config, option)}: expected --protocol generalisation with it; "
+                "leave it out"
+            )
+    made = {}
+    for name in names:
+        train, test, title = _protocols(config, dataset, name)
+        noise = Corruption(train, test, config.kind, redraw=config.redraw)
+        made[name] = Case(title, noise)
+    return made
+
+
+def scores(output: TestOutput, n_classes: int) -> dict[str, Any]:
+    """Accuracy by part, gate scores and confusion matrix of a test output."""
+    from fusion import evaluate
+
+    predicted = output.logits.argmax(-1)
+    split = evaluate.split_accuracy(output.labels, predicted, output.failed)
+    result: dict[str, Any] = {
+        "accuracy": 100.0 * split.overall,
+        "accuracy_clean": 100.0 * split.clean,
+        "accuracy_corrupted": 100.0 * split.corrupted,
+        "confusion": evaluate.confusion_matrix(output.labels, predicted, n_classes),
+    }
+    for among in ("pooled", "channel"):
+        result[f"gate_auroc_{among}"] = evaluate.gate_auroc(
+            output.weights, output.failed, among=among
+        )
+    clean, failed = evaluate.mean_weights(output.weights, output.failed)
+    return result | {"weight_clean": clean, "weight_failed": failed}
+
+
+def train_and_test(
+    settings: Preset, dataset: Dataset, noise: Corruption, seed: int, **options: Any
+) -> tuple[FitResult, TestOutput]:
+    """Train one network and run it on the test rows; `options` are those of `fusion.fit`."""
+    import jax
+
+    from fusion.loop import fit, test_output
+
+    key = jax.random.key(seed)
+    fitted = fit(*settings, dataset, noise, key=key, **options)
+    return fitted, test_output(settings.model, fitted.state, dataset, noise, key=key)

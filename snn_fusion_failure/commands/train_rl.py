@@ -27,6 +27,7 @@ from snn_fusion_failure.runs import (
     write_json,
 )
 from snn_fusion_failure.runs.command import run_command
+from snn_fusion_failure.runs.provenance import check_recordable
 
 # Greedy tests of the Q-learner after so many training trials, each a multiple of the chunk before
 # it.
@@ -215,6 +216,8 @@ def main(config: Config) -> dict[str, Any]:
         )
     if config.record and config.preset != "paper":
         raise ValueError("a quick run is no result of record; leave --record or --preset quick out")
+    if config.record:
+        check_recordable()
     if config.preset == "quick":
         config = dataclasses.replace(config, seeds=min(config.seeds, 4))
     enable_compilation_cache()

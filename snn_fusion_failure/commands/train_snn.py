@@ -29,6 +29,7 @@ from snn_fusion_failure.runs import (
     write_json,
 )
 from snn_fusion_failure.runs.command import run_command
+from snn_fusion_failure.runs.provenance import check_recordable
 
 TEST_TRIALS = {1: 30, 2: 20, 3: 20}
 UNITS = {"n_mv": "steps", "path": "px", "path_ratio": "1", "path_ratio_median": "1"}
@@ -264,6 +265,8 @@ def main(config: TrainSnn) -> dict[str, Any]:
 
     if config.seeds < 1 or config.chunk < 1:
         raise ValueError(f"seeds = {config.seeds}, chunk = {config.chunk}: expected at least 1")
+    if config.record:
+        check_recordable()
     quick = config.preset == "quick"
     n_seeds = min(config.seeds, 4) if quick else config.seeds
     n_test = 10 if quick else TEST_TRIALS[config.scenario]

@@ -26,6 +26,7 @@ from snn_fusion_failure.runs import (
     repository,
     write_json,
 )
+from snn_fusion_failure.runs.provenance import check_recordable
 
 TABLES = {"ldo": ("4.1", "LDO regulator"), "dcdc": ("4.2", "DC-DC converter")}
 
@@ -240,6 +241,8 @@ def main(config: Config) -> dict[str, Any]:
     names = config.specs or circuit.spec_names
     methods = config.methods or tuple(METHODS)
     columns = [circuit.spec_index(name) for name in names]
+    if config.record:
+        check_recordable()
     enable_compilation_cache()
     rows: list[dict[str, Any]] = []
     with progress() as bar:

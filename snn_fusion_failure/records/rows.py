@@ -8,8 +8,9 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.records.intervals import interval
+from snn_fusion_failure.runs import repository
 from snn_fusion_failure.runs.files import write_json
-from snn_fusion_failure.runs.provenance import provenance
+from snn_fusion_failure.runs.provenance import check_recordable, provenance
 
 
 def summarize(values: Sequence[float]) -> dict[str, Any]:
@@ -29,10 +30,23 @@ def record_table(
     """Write or update a table of record; rows are replaced by (row, model, metric), others stay.
 
     Every row keeps the command and the commit that made it; the interval of a share is one that
-    stays within 0 and 100 %.
+    stays within 0 and 100 %. Numbers of code that was changed and not committed are refused in
+    `results/`, and kept under `runs/refused/` instead, unless `SFF_ALLOW_DIRTY=1` is set; their
+    `git` field ends in `-dirty`.
+
+    Raises:
+        ValueError: the rows belong into `results/`, and nobody could say which code made them.
     """
     made = provenance()
     rows = [{"command": made["command"], "git": made["git"], **row, **_ends(row)} for row in rows]
+    if path.resolve().is_relative_to(repository.RECORD):
+        try:
+            check_recordable(f"record of {path.name}")
+        except ValueError as error:
+            # The work of hours is not thrown away over it.
+            kept_in = Path("runs") / "refused" / path.name
+            write_json(kept_in, {"table": table, "title": title, "preset": preset, "rows": rows})
+            raise ValueError(f"{error}; the rows are kept in {kept_in}") from error
     held: list[dict[str, Any]] = []
     if path.exists():
         held = json.loads(path.read_text(encoding="utf-8"))["rows"]

@@ -11,6 +11,8 @@ IS_CHECKOUT = (ROOT / "pyproject.toml").is_file() and (ROOT / "results").is_dir(
 """False for an installed wheel, which has neither scripts nor a place for results of record."""
 RESULTS = ROOT / "results" if IS_CHECKOUT else PACKAGE / "results"
 """Results of record; the wheel carries a copy, to be read only."""
+RECORD = RESULTS.resolve()
+"""The same, whatever a test puts in its place."""
 
 
 def require_checkout(option: str) -> None:

@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import json
 import sys
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,15 +15,21 @@ from scipy import stats
 
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
+    WorkFailedError,
     append_metrics,
     command_line,
     fail,
     open_run,
     print_result,
     repository,
+    run_command,
     write_json,
     write_text,
 )
+
+# The package's own `provenance` is the function of that name.
+made_by = importlib.import_module("snn_fusion_failure.runs.provenance")
+folder = importlib.import_module("snn_fusion_failure.runs.folder")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,6 +84,58 @@ def test_a_run_folder_is_claimed_once(tmp_path: Path) -> None:
     open_run(out, Settings(), resume=True)
     with pytest.raises(ValueError, match=r"other settings \(epochs: 3 -> 4; model: 'a' -> 'b'\)"):
         open_run(out, Settings("b", 4), resume=True)
+
+
+def test_a_resumed_run_keeps_who_made_its_beginning(tmp_path, monkeypatch) -> None:
+    open_run(tmp_path, Settings())
+    first = json.loads((tmp_path / "config.json").read_text())
+    monkeypatch.setattr(folder, "provenance", lambda: {"git": "later", "command": "again"})
+    open_run(tmp_path, Settings(), resume=True)
+    held = json.loads((tmp_path / "config.json").read_text())
+    assert {k: held[k] for k in first} == first
+    assert held["resumed"] == [{"git": "later", "command": "again"}]
+
+
+def test_results_of_record_refuse_changed_code(tmp_path, monkeypatch) -> None:
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.setattr(repository, "RECORD", tmp_path)
+    monkeypatch.setattr(made_by, "changed_code", lambda: ["fusion/train.py"])
+    monkeypatch.delenv(made_by.ALLOW_DIRTY, raising=False)
+    path, row = tmp_path / "table_9_9.json", {"row": "r", "model": "m", "metric": "x", "mean": 1.0}
+    with pytest.raises(ValueError, match=r"fusion/train\.py changed; commit first.*kept in runs"):
+        record_table(path, "9.9", "T", [row], preset="paper")
+    assert not path.exists()
+    kept = json.loads((tmp_path / "runs" / "refused" / path.name).read_text())["rows"]
+    assert kept[0]["mean"] == 1.0
+    monkeypatch.setenv(made_by.ALLOW_DIRTY, "1")
+    record_table(path, "9.9", "T", [row], preset="paper")
+    found = json.loads(path.read_text())
+    assert found["git"].endswith("-dirty") and found["rows"][0]["git"].endswith("-dirty")
+    monkeypatch.setattr(repository, "IS_CHECKOUT", False)
+    with pytest.raises(ValueError, match="expected a checkout"):
+        repository.require_checkout("--record")
+
+
+def test_work_that_failed_is_missing_or_interrupted_has_its_exit_status(capsys) -> None:
+    def leave(found) -> int:
+        def main(_: Settings) -> Any:
+            if isinstance(found, BaseException):
+                raise found
+            return found
+
+        try:
+            run_command(Settings, main, description=None, fields=dict, argv=[], prog="x")
+        except SystemExit as left:
+            return left.code
+        return 0
+
+    assert leave({"failed": 0, "missing": 0}) == 0
+    assert leave({"failed": 3}) == leave({"missing": 1}) == 1
+    assert leave(ValueError("bad")) == 2
+    assert leave(WorkFailedError("half")) == 1
+    capsys.readouterr()
+    assert leave(KeyboardInterrupt()) == 130
+    assert capsys.readouterr().err.startswith("interrupted: what was finished is kept")
 
 
 def test_overwrite_forgets_the_old_numbers(tmp_path: Path) -> None:

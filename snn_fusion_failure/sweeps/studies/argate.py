@@ -17,8 +17,8 @@ from fusion import failures
 from fusion.data import load, validation_split
 from fusion.models import export
 from fusion.presets import preset as named_preset
-from fusion.train import make_train, predict_batches
-from snn_fusion_failure.sweeps.study import Metric, Study
+from fusion.train import init_state, make_epoch, make_train, predict_batches
+from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
 __all__ = ["make"]
 
@@ -38,12 +38,24 @@ def make(
     if epochs:
         train_config = dataclasses.replace(train_config, epochs=epochs)
     protocol = failures.random_failing(data.channels, n_clean)
-    train = make_train(config, train_config, len(data.train_y), protocol, kind)
+    make_train(config, train_config, len(data.train_y), protocol, kind)  # refuses what cannot run
+    epoch = make_epoch(config, train_config, len(data.train_y))
     train_x, train_y = jnp.asarray(data.train_x), jnp.asarray(data.train_y)
     score_x, score_y = jnp.asarray(data.test_x), jnp.asarray(data.test_y)
 
-    def trial(params: Any, key: Any) -> dict[str, Any]:
-        state, metrics = train(params, train_x, train_y, key=key)
+    def start(params: Any, key: Any) -> Any:
+        return init_state(jax.random.fold_in(key, 0), config, train_config)
+
+    def advance(params: Any, key: Any, state: Any, begin: int, end: int) -> Any:
+        """Epochs `begin` to `end - 1` of `fusion.train.make_train`, then the score."""
+
+        def body(state: Any, index: Any) -> Any:
+            draw = jax.random.fold_in(jax.random.fold_in(key, 2), index)
+            noisy, failed = failures.corrupt(protocol, train_x, kind, key=draw)
+            step_key = jax.random.fold_in(jax.random.fold_in(key, 1), index)
+            return epoch(params, state, noisy, train_y, failed, key=step_key)
+
+        state, metrics = jax.lax.scan(body, state, jnp.arange(begin, end))
         x, failed = failures.corrupt(protocol, score_x, kind, key=jax.random.fold_in(key, 3))
         logits, _ = predict_batches(config, export(state.params), x, failed)
         hit = (jnp.argmax(logits, -1) == score_y).astype(jnp.float32)
@@ -51,12 +63,20 @@ def make(
         loss = metrics.loss.total[-1]
         # Without a finite loss the accuracy of what is left means nothing.
         valid = jnp.where(jnp.isfinite(loss), 1.0, jnp.nan)
-        return {
+        return state, {
             "accuracy": valid * 100.0 * jnp.mean(hit),
             "accuracy_clean": valid * 100.0 * jnp.mean(hit, where=~broken),
             "accuracy_corrupted": valid * 100.0 * jnp.mean(hit, where=broken),
             "loss": loss,
         }
+
+    total = train_config.epochs
+
+    def trial(params: Any, key: Any) -> Any:
+        return advance(params, key, start(params, key), 0, total)[1]
+
+    def advance_all(params: Any, keys: Any, carry: Any, begin: int, end: int) -> Any:
+        return jax.vmap(lambda p, k, c: advance(p, k, c, begin, end))(params, keys, carry)
 
     def check(params: Any) -> None:
         for name, values in (
@@ -78,5 +98,6 @@ def make(
         },
         objective="accuracy",
         check=check,
-        with_budget=None,
+        budget_text="epochs",
+        carry=Carry(jax.vmap(start), advance_all, total),
     )

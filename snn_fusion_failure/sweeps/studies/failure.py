@@ -18,7 +18,7 @@ import jax.numpy as jnp
 from failure import circuits
 from failure.models import acquisition, gp, gp_fit
 from failure.models.optimize import Domain, box, sample
-from snn_fusion_failure.sweeps.study import Metric, Study
+from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
 __all__ = ["SearchParams", "make"]
 
@@ -61,7 +61,8 @@ def make(
         seen = (jnp.arange(n_total) < n) & jnp.isfinite(y)
         return jnp.where(seen, y, jnp.min(jnp.where(seen, y, jnp.inf)))
 
-    def trial(params: SearchParams, key: Any) -> dict[str, Any]:
+    def trial(params: SearchParams, key: Any, carry: Any, begin: int, end: int) -> Any:
+        """Simulations up to `end`, from the start or from the carry of those before `begin`."""
         half = jnp.full((dim,), 0.5)
         cube = box(-half, half)
         scale = 2.0 * params.size
@@ -91,22 +92,35 @@ def make(
             point = points[jnp.argmax(value)]
             return (u.at[n].set(point), y.at[n].set(simulate(scale * point[None])[0]), fitted), None
 
-        start = (u, y, gp_fit.initial_params(config, dim))
-        (_, y, _), _ = jax.lax.scan(step, start, jnp.arange(n_init, n_total))
-        valid = jnp.isfinite(y)
+        start = (u, y, gp_fit.initial_params(config, dim)) if carry is None else carry
+        carry, _ = jax.lax.scan(step, start, jnp.arange(max(begin, n_init), max(end, n_init)))
+        y = carry[1]
+        done = jnp.arange(n_total) < end
+        valid = jnp.isfinite(y) & done
         worst = sign * jnp.max(jnp.where(valid, y, -jnp.inf))
         first = sign * jnp.max(jnp.where(valid, y, -jnp.inf)[:n_init])
         out = {
             "worst": worst,
             "worst_initial": first,
-            "invalid": jnp.sum(~valid).astype(y.dtype),
+            "invalid": jnp.sum(done & ~valid).astype(y.dtype),
         }
         if threshold is not None:
             failed = valid & (y > sign * threshold)
             out["hit"] = jnp.where(jnp.any(failed), 100.0, 0.0)
             number = (jnp.argmax(failed) + 1).astype(y.dtype)
             out["first_hit"] = jnp.where(jnp.any(failed), number, jnp.nan)
-        return out
+        return carry, out
+
+    # One after another whatever the chunk size: a batched factorisation is no faster on a CPU, and
+    # a search amplifies its last bits.
+    def run(params: Any, keys: Any) -> Any:
+        return jax.lax.map(lambda xs: trial(*xs, None, 0, n_total)[1], (params, keys))
+
+    def begin_all(params: Any, keys: Any) -> Any:
+        return jax.lax.map(lambda xs: trial(*xs, None, 0, n_init)[0], (params, keys))
+
+    def advance(params: Any, keys: Any, carry: Any, begin: int, end: int) -> Any:
+        return jax.lax.map(lambda xs: trial(*xs, begin, end), (params, keys, carry))
 
     def check(params: SearchParams) -> None:
         for name, low, high in (("size", 0.0, 6.0), ("weight", -1e-9, 1.0), ("region", 0.0, 1.0)):
@@ -129,12 +143,12 @@ def make(
         name="failure",
         options={},
         params=SearchParams(),
-        # One after another whatever the chunk size: a batched factorisation is no faster on a CPU,
-        # and a search amplifies its last bits.
-        run=lambda params, keys: jax.lax.map(lambda xs: trial(*xs), (params, keys)),
+        run=run,
         metrics=metrics,
         objective="hit" if threshold is not None else "worst",
         unit_of=lambda leaf: "sigma" if leaf == "size" else "",
         check=check,
         dtype="float64",
+        budget_text="simulations",
+        carry=Carry(begin_all, advance, n_total),
     )

@@ -13,7 +13,7 @@ import jax
 import jax.numpy as jnp
 
 from jaxsnn.neurons import LIFParams, check_lif, lif_init, lif_step
-from snn_fusion_failure.sweeps.study import Metric, Study
+from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
 __all__ = ["LIFStudy", "make"]
 
@@ -37,19 +37,30 @@ def make(steps: int = 1000, dt: float = 1e-3) -> Study:
     if steps < 1:
         raise ValueError(f"steps = {steps}: expected at least 1")
 
-    def trial(params: LIFStudy, key: Any) -> dict[str, Any]:
+    def start(params: LIFStudy, key: Any) -> Any:
+        finite = jnp.ones((), bool)
+        return lif_init(params.neuron, 1), jnp.zeros((), jnp.int32), finite
+
+    def advance(params: LIFStudy, key: Any, carry: Any, begin: int, end: int) -> Any:
         def body(carry: Any, step: Any) -> Any:
+            state, count, finite = carry
             noise = params.noise * jax.random.normal(jax.random.fold_in(key, step))
             current = jnp.reshape(params.drive + noise, (1,))
-            state, spikes = lif_step(params.neuron, carry[0], current, jnp.zeros(1), dt=dt)
-            return (state, carry[1] + jnp.sum(spikes, dtype=jnp.int32)), state.v[0]
+            state, spikes = lif_step(params.neuron, state, current, jnp.zeros(1), dt=dt)
+            finite = finite & jnp.all(jnp.isfinite(state.v))
+            return (state, count + jnp.sum(spikes, dtype=jnp.int32), finite), None
 
-        start = (lif_init(params.neuron, 1), jnp.zeros((), jnp.int32))
-        (_, count), v = jax.lax.scan(body, start, jnp.arange(steps))
+        carry, _ = jax.lax.scan(body, carry, jnp.arange(begin, end))
+        _, count, finite = carry
         # A membrane that is not finite never fires: its rate is no number either.
-        broken = jnp.where(jnp.all(jnp.isfinite(v)), 0.0, jnp.nan)
-        rate = count.astype(jnp.float32) / (steps * dt) + broken
-        return {"rate": rate, "error": jnp.abs(rate - params.target)}
+        rate = count.astype(jnp.float32) / (end * dt) + jnp.where(finite, 0.0, jnp.nan)
+        return carry, {"rate": rate, "error": jnp.abs(rate - params.target)}
+
+    def trial(params: LIFStudy, key: Any) -> dict[str, Any]:
+        return advance(params, key, start(params, key), 0, steps)[1]
+
+    def advance_all(params: Any, keys: Any, carry: Any, begin: int, end: int) -> Any:
+        return jax.vmap(lambda p, k, c: advance(p, k, c, begin, end))(params, keys, carry)
 
     def check(params: LIFStudy) -> None:
         check_lif(params.neuron, dt=dt)
@@ -68,4 +79,5 @@ def make(steps: int = 1000, dt: float = 1e-3) -> Study:
         check=check,
         with_budget=lambda budget: make(budget, dt),
         budget_text="steps",
+        carry=Carry(jax.vmap(start), advance_all, steps),
     )

@@ -37,7 +37,7 @@ class BudgetSpentError(RuntimeError):
 
 
 class Archive:
-    """All samples of an analysis, counted against a budget."""
+    """All samples of an analysis, each simulated once and counted against a budget."""
 
     def __init__(self, evaluate: Evaluate, dim: int, budget: int) -> None:
         self._evaluate = evaluate
@@ -46,6 +46,7 @@ class Archive:
         self.g: np.ndarray | None = None
         self.labels: list[str] = []
         self.spent = 0
+        self._known: dict[bytes, np.ndarray] = {}
 
     @property
     def left(self) -> int:
@@ -57,6 +58,7 @@ class Archive:
         self.x = np.concatenate([self.x, x])
         self.g = g if self.g is None else np.concatenate([self.g, g])
         self.labels += [label] * len(x)
+        self._known.update((row.tobytes(), values) for row, values in zip(x, g, strict=True))
 
     def __call__(self, x: Float[np.ndarray, "n d"], label: str) -> Float[np.ndarray, "n k"]:
         """Violations of new samples.
@@ -64,14 +66,17 @@ class Archive:
         Raises:
             BudgetSpentError: the budget does not hold them.
         """
-        if len(x) > self.left:
-            raise BudgetSpentError(f"{len(x)} simulations wanted, {self.left} left")
-        g = np.asarray(self._evaluate(np.asarray(x, np.float64)), np.float64)
-        if g.ndim != 2 or len(g) != len(x):
-            raise ValueError(f"violations of shape {g.shape}: expected [{len(x)}, k]")
-        self.spent += len(x)
-        self.add(np.asarray(x, np.float64), g, label)
-        return g
+        x = np.asarray(x, np.float64)
+        new = np.array([row for row in x if row.tobytes() not in self._known])
+        if len(new) > self.left:
+            raise BudgetSpentError(f"{len(new)} simulations wanted, {self.left} left")
+        if len(new):
+            g = np.asarray(self._evaluate(new), np.float64)
+            if g.ndim != 2 or len(g) != len(new):
+                raise ValueError(f"violations of shape {g.shape}: expected [{len(new)}, k]")
+            self.spent += len(new)
+            self.add(new, g, label)
+        return np.array([self._known[row.tobytes()] for row in x])
 
 
 class Region(NamedTuple):
@@ -176,7 +181,7 @@ def worst_case_points(
     *,
     reach: float = 8.0,
     iterations: int = 4,
-    step: float = 0.1,
+    step: float = 0.3,
 ) -> list[Region]:
     r"""The nearest failing point of specifications, each from a start direction.
 
@@ -230,7 +235,9 @@ def worst_case_points(
             if better or region.converged:
                 found[k] = region
             norm2 = float(slope @ slope)
-            if region.converged or norm2 < 1e-20:
+            # Far from the limit at the end of the reach: the next ray will not meet it either.
+            hopeless = not region.failed and value < -0.5 and lengths[row] >= 0.99 * reach
+            if region.converged or hopeless or norm2 < 1e-20:
                 continue
             target[k] = (slope @ points[row] - value) / norm2 * slope
             still.append(k)

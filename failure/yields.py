@@ -12,13 +12,12 @@ from collections.abc import Sequence
 from typing import NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Key
 
 from failure.worst_case import Archive, Region
 
-__all__ = ["Mixture", "SpecYield", "line_sampling", "mixture_sampling", "normal_draws"]
+__all__ = ["Mixture", "SpecYield", "interval", "line_sampling", "mixture_sampling", "normal_draws"]
 
 
 class SpecYield(NamedTuple):
@@ -40,13 +39,12 @@ class SpecYield(NamedTuple):
 
 
 def normal_draws(count: int, dim: int, *, key: Key[Array, ""]) -> Float[np.ndarray, "n d"]:
-    """Normal samples of which a longer draw keeps the beginning: `x_i = N(fold_in(key, i))`."""
-    with jax.enable_x64(True):
-        one = jax.vmap(lambda i: jax.random.normal(jax.random.fold_in(key, i), (dim,)))
-        return np.asarray(one(jnp.arange(count)))
+    """Normal samples `[n, d]` on the host; a longer draw begins with the shorter one."""
+    words = np.asarray(jax.random.key_data(key)).astype(np.uint64).ravel()
+    return np.random.Generator(np.random.Philox(words)).standard_normal((count, dim))
 
 
-def _interval(terms: np.ndarray) -> tuple[float, float, float, str]:
+def interval(terms: Float[np.ndarray, "n"]) -> tuple[float, float, float, str]:
     """Mean of positive terms, log-normal 95 % interval, verdict."""
     from scipy.stats import t as student
 
@@ -116,7 +114,7 @@ def line_sampling(
         ta, ga = np.where(near, t1[rows], t0[rows]), np.where(near, g1[rows], g0[rows])
         t2[rows] = _secant(ta, ga, t2[rows], g2, rate, most)
     terms = np.where(t2 >= most, 0.0, ndtr(-t2))
-    mean, lower, upper, verdict = _interval(terms)
+    mean, lower, upper, verdict = interval(terms)
     if not region.converged:
         verdict = "its worst-case point is not verified"
     return SpecYield(mean, lower, upper, lines, verdict), terms
@@ -138,17 +136,11 @@ class Mixture(NamedTuple):
         specs: estimate of each specification.
         union: of failing any.
         overlap: probability of failing any over the sum of all.
-        strangers: failing samples `[s, d]` and their specification, away from all known regions.
-        weights: of the samples.
-        g: their violations.
     """
 
     specs: list[SpecYield]
     union: SpecYield
     overlap: float
-    strangers: list[tuple[int, np.ndarray]]
-    weights: Float[np.ndarray, "n"]
-    g: Float[np.ndarray, "n k"]
 
 
 def mixture_sampling(
@@ -157,9 +149,8 @@ def mixture_sampling(
     n: int,
     n_specs: int,
     *,
-    wide: float = 0.15,
+    wide: float = 0.1,
     nominal: float = 0.1,
-    alike: float = 0.6,
     key: Key[Array, ""],
 ) -> Mixture:
     r"""Importance sampling from normals about all regions, of all specifications at once.
@@ -174,8 +165,6 @@ def mixture_sampling(
         n_specs: number of specifications.
         wide: share :math:`\gamma` of the wide part, s such that its radius is that of the regions.
         nominal: share :math:`\alpha`.
-        alike: a failing sample whose cosine with every region of its specification is below this
-            belongs to another one.
         key: random key.
 
     Source: Hesterberg (1995) for the defensive mixture.
@@ -208,7 +197,7 @@ def mixture_sampling(
     fails = g > 0.0
 
     def estimate(hit: np.ndarray) -> SpecYield:
-        mean, lower, upper, verdict = _interval(weights * hit)
+        mean, lower, upper, verdict = interval(weights * hit)
         if math.isnan(mean):
             # Rule of three over what the nominal part stands for.
             upper = min(1.0, 3.0 / max(float(weights.sum()), 1.0))
@@ -218,12 +207,4 @@ def mixture_sampling(
     union = estimate(fails.any(1))
     total = sum(p.probability for p in specs if not math.isnan(p.probability))
     overlap = union.probability / total if total > 0.0 else 1.0
-    strangers = []
-    limit = max((r.distance for r in regions), default=math.inf) + 1.5
-    for k in range(n_specs):
-        own = [r.point / r.distance for r in regions if r.spec == k]
-        for point in x[fails[:, k]]:
-            length = float(np.linalg.norm(point))
-            if length < limit and all(point @ a / length < alike for a in own):
-                strangers.append((k, point))
-    return Mixture(specs, union, overlap, strangers, weights, g)
+    return Mixture(specs, union, overlap)

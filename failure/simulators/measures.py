@@ -12,7 +12,7 @@ from jaxtyping import Float
 
 from failure.simulators.spice import parse_number
 
-__all__ = ["Limit", "parse_limit", "violation"]
+__all__ = ["Limit", "one_sided", "parse_limit", "violation"]
 
 _NAME = r"[A-Za-z_][\w.:()\[\]#@]*"
 _ONE = re.compile(rf"({_NAME})(<=|>=|<|>)(\S+)")
@@ -64,6 +64,18 @@ def parse_limit(text: str) -> Limit:
     if not found.low < found.high:
         raise ValueError(f"measure={text!r}: expected a range; its low limit is not below the high")
     return found
+
+
+def one_sided(limit: Limit) -> list[Limit]:
+    """A window as its two sides, which fail in regions of their own.
+
+    Example:
+        >>> [side.text for side in one_sided(parse_limit("-5<=offset<=5"))]
+        ['offset>=-5', 'offset<=5']
+    """
+    if math.isinf(limit.low) or math.isinf(limit.high):
+        return [limit]
+    return [limit._replace(high=math.inf), limit._replace(low=-math.inf)]
 
 
 def violation(

@@ -3,7 +3,8 @@
 Every program leads a process group of its own, so a time limit or Ctrl-C ends it together with the
 processes that it has started. For the ends that no code of ours sees (TERM, `kill -9`, a crash) a
 guard stands by: a small process that holds one end of a pipe and ends all groups that are still
-running when the other end, ours, closes.
+running when the other end, ours, closes. A program passes a gate first, which opens when the guard
+knows of it, so that there is no moment at which it could be left alone.
 """
 
 from __future__ import annotations
@@ -11,6 +12,7 @@ from __future__ import annotations
 import contextlib
 import os
 import select
+import shutil
 import signal
 import subprocess
 import sys
@@ -34,6 +36,9 @@ for group in running:
     except OSError:
         pass
 """
+
+_GATE = 'read -r go </dev/fd/{0} || exit 125; exec "$@"'
+"""Shell text that waits for a line on a file and then becomes the program."""
 
 _lock = threading.Lock()
 _guards: dict[int, subprocess.Popen[str]] = {}
@@ -148,27 +153,33 @@ class Group:
         Raises:
             SimulatorError: the program cannot be started, or `end` was called.
         """
+        if shutil.which(argv[0]) is None:
+            raise SimulatorError(
+                f"command={argv[0]!r}: expected a program that can be started; there is none of "
+                "this name; give the full path of the simulator"
+            )
         # Files, not pipes: a background process that keeps a pipe open would hold us up.
         with tempfile.TemporaryFile() as given, tempfile.TemporaryFile() as out, \
                 tempfile.TemporaryFile() as err:  # fmt: skip
             given.write(stdin.encode())
             given.seek(0)
             start = time.monotonic()
-            with self._lock:
-                if self._ended:
-                    raise SimulatorError("the simulations were ended")
-                try:
+            gate, opener = os.pipe()
+            try:
+                with self._lock:
+                    if self._ended:
+                        raise SimulatorError("the simulations were ended")
                     process = subprocess.Popen(
-                        argv, stdin=given, stdout=out, stderr=err, cwd=cwd, env=env,
-                        start_new_session=True,
+                        ["/bin/sh", "-c", _GATE.format(gate), "sh", *argv],
+                        stdin=given, stdout=out, stderr=err, cwd=cwd, env=env,
+                        start_new_session=True, pass_fds=(gate,),
                     )  # fmt: skip
-                except OSError as error:
-                    raise SimulatorError(
-                        f"command={argv[0]!r}: expected a program that can be started "
-                        f"({error.strerror}); give the full path of the simulator"
-                    ) from error
-                self._running.add(process.pid)
-            watch(process.pid)
+                    self._running.add(process.pid)
+                watch(process.pid)
+                os.write(opener, b"go\n")
+            finally:
+                os.close(gate)
+                os.close(opener)
             try:
                 timed_out = not _wait(process, timeout)
             finally:

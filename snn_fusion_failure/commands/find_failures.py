@@ -9,12 +9,15 @@ Runs `seeds` searches side by side (`--preset paper`: 50 initial and 250 further
 `--threshold` it is set at 90 % of the way from the nominal value to the worst one that gradient
 ascents find. `--set search.refit_every=4` changes a constant of the search.
 
+A netlist of your own: `sff find-failures --netlist FILE --help`.
+
 One seed takes 10 to 30 CPU-seconds beside the simulations, the first run 30 more to compile.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import sys
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
@@ -182,5 +185,13 @@ def main(config: Config) -> dict[str, Any]:
 
 
 def cli(argv: Sequence[str] | None = None, prog: str | None = None) -> None:
-    """Parse, run, print the result line."""
+    """Parse, run, print the result line; `--netlist` asks for a netlist's own options."""
+    given = sys.argv[1:] if argv is None else argv
+    if any(word.split("=")[0] == "--netlist" for word in given):
+        from snn_fusion_failure.commands import netlist_failures as other
+
+        run_command(
+            other.NetlistConfig, other.main, description=other.__doc__, argv=argv, prog=prog
+        )
+        return
     run_command(Config, main, description=__doc__, argv=argv, prog=prog)

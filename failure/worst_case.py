@@ -233,7 +233,7 @@ def worst_case_points(
                 held.failed, -held.distance,
             )  # fmt: skip
             if better or region.converged:
-                found[k] = region
+                found[k] = _onto_limit(region)
             norm2 = float(slope @ slope)
             # Far from the limit at the end of the reach: the next ray will not meet it either.
             hopeless = not region.failed and value < -0.5 and lengths[row] >= 0.99 * reach
@@ -243,6 +243,15 @@ def worst_case_points(
             still.append(k)
         active = np.asarray(still, int)
     return [found[k] for k in sorted(found)]
+
+
+def _onto_limit(region: Region) -> Region:
+    """A converged point moved along its direction to where its slope puts the limit."""
+    a = region.point / max(region.distance, 1e-300)
+    rate = float(region.slope @ a)
+    if not region.converged or rate <= 0.0:
+        return region
+    return region._replace(point=region.point - region.gap / rate * a)
 
 
 def find_regions(
@@ -262,7 +271,8 @@ def find_regions(
     Raises:
         ValueError: the nominal circuit fails.
     """
-    known_x, known_g = archive.x, archive.g
+    known = np.array([label == "start" for label in archive.labels], bool)
+    known_x, known_g = archive.x[known], archive.g[known] if archive.g is not None else None
     nominal = archive(np.zeros((1, dim)), "nominal")[0]
     if not np.all(nominal < 0.0):
         bad = np.flatnonzero(~(nominal < 0.0))

@@ -68,7 +68,7 @@ class SpecAnalysis(NamedTuple):
 
 
 class Analysis(NamedTuple):
-    """Result of `analyse`; `archive` holds every sample."""
+    """Result of `analyse`; `archive` holds every sample, violations over their nominal size."""
 
     nominal: Float[np.ndarray, "k"]
     specs: list[SpecAnalysis]
@@ -112,9 +112,20 @@ def analyse(
             f"n_total={config.n_total}: expected at least {dim + 10}: one simulation per parameter "
             "for the first slopes, and some"
         )
-    archive = Archive(evaluate, dim, config.n_total)
+    origin = np.zeros((1, dim))
+    at_origin = np.asarray(evaluate(origin), np.float64)
+    if at_origin.ndim != 2 or len(at_origin) != 1 or not np.all(at_origin < 0.0):
+        raise ValueError(
+            f"violations at the nominal circuit {at_origin.tolist()}: expected one row [1, k] "
+            "below 0; a nominal circuit that fails has no rare failures"
+        )
+    # Relative to the nominal distance from the limit: no number below depends on a unit.
+    scale = np.abs(at_origin[0])
+    archive = Archive(lambda x: np.asarray(evaluate(x), np.float64) / scale, dim, config.n_total)
+    archive.add(origin, at_origin / scale, "nominal")
+    archive.spent = 1
     if start is not None:
-        archive.add(*start, "start")
+        archive.add(start[0], start[1] / scale, "start")
     nominal, regions = find_regions(archive, dim, reach=config.reach)
     n_specs = len(nominal)
     key_explore, key_lines, key_mixture = jax.random.split(key, 3)
@@ -133,7 +144,7 @@ def analyse(
             lines[k] = line_sampling(archive, found[k], count, reach=config.reach, key=sub)
     mixture = mixture_sampling(archive, found, archive.left, n_specs, key=key_mixture)
     specs = [_of_spec(k, found, lines, mixture, config.reach) for k in range(n_specs)]
-    return Analysis(nominal, specs, _of_any(specs, mixture), archive)
+    return Analysis(at_origin[0], specs, _of_any(specs, mixture), archive)
 
 
 def _apart(regions: list[Region]) -> list[int]:

@@ -54,7 +54,8 @@ def interval(terms: Float[np.ndarray, "n"]) -> tuple[float, float, float, str]:
     error = float(terms.std(ddof=1)) / math.sqrt(n)
     effective = float(terms.sum() ** 2 / (terms**2).sum())
     factor = float(student.ppf(0.975, max(min(n - 1, effective), 1.0)))
-    spread = math.sqrt(math.log1p((error / mean) ** 2))
+    # Never below half a percent: that is what the secants of the lines may be off.
+    spread = max(math.sqrt(math.log1p((error / mean) ** 2)), 2.5e-3)
     verdict = "good" if effective >= 10.0 else f"only {effective:.1f} effective samples"
     width = math.exp(factor * spread)
     return mean, mean / width, min(mean * width, 1.0), verdict

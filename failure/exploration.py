@@ -47,8 +47,9 @@ def explore(
     key_wide, key_centre = jax.random.split(key)
     scale = float(np.clip(1.5 * 5.0 / math.sqrt(dim), 1.2, 2.0))
     mirrored = [-1.15 * r.point for r in regions if 1.15 * r.distance <= reach]
-    points = np.array([*mirrored, *(scale * normal_draws(n, dim, key=key_wide))])[: archive.left]
-    g = archive(points.reshape(-1, dim), "explore")
+    points = np.array([*mirrored, *(scale * normal_draws(n, dim, key=key_wide))])
+    points = points.reshape(-1, dim)[: archive.left]
+    g = archive(points, "explore")
     known = {k: [r for r in regions if r.spec == k] for k in range(len(nominal))}
     starts: list[tuple[int, np.ndarray]] = []
     for k in range(len(nominal)):

@@ -76,6 +76,8 @@ class Archive:
                 raise ValueError(f"violations of shape {g.shape}: expected [{len(new)}, k]")
             self.spent += len(new)
             self.add(new, g, label)
+        if len(x) == 0 and self.g is not None:
+            return np.zeros((0, self.g.shape[1]))
         return np.array([self._known[row.tobytes()] for row in x])
 
 
@@ -181,7 +183,7 @@ def worst_case_points(
     *,
     reach: float = 8.0,
     iterations: int = 4,
-    step: float = 0.3,
+    step: float = 0.5,
 ) -> list[Region]:
     r"""The nearest failing point of specifications, each from a start direction.
 

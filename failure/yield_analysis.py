@@ -132,6 +132,7 @@ def analyse(
     found = explore(
         archive, nominal, regions, archive.left // 5, reach=config.reach, key=key_explore
     )
+    found = [*found, *_seen(archive, found, n_specs)]
     lines: dict[int, tuple[SpecYield, np.ndarray]] = {}
     measured = _apart(found)
     if measured:
@@ -145,6 +146,20 @@ def analyse(
     mixture = mixture_sampling(archive, found, archive.left, n_specs, key=key_mixture)
     specs = [_of_spec(k, found, lines, mixture, config.reach) for k in range(n_specs)]
     return Analysis(at_origin[0], specs, _of_any(specs, mixture), archive)
+
+
+def _seen(archive: Archive, regions: list[Region], n_specs: int) -> list[Region]:
+    """For specifications without a region, the nearest failing sample there is, not verified."""
+    more = []
+    for k in range(n_specs):
+        if archive.g is None or any(r.spec == k for r in regions):
+            continue
+        failing = np.flatnonzero(archive.g[:, k] > 0.0)
+        if failing.size:
+            nearest = failing[np.argmin(np.linalg.norm(archive.x[failing], axis=1))]
+            point, gap = archive.x[nearest], float(archive.g[nearest, k])
+            more.append(Region(k, point, np.zeros_like(point), gap, 0.0, True))
+    return more
 
 
 def _apart(regions: list[Region]) -> list[int]:

@@ -48,7 +48,7 @@ def interval(terms: Float[np.ndarray, "n"]) -> tuple[float, float, float, str]:
     """Mean of positive terms, log-normal 95 % interval, verdict."""
     from scipy.stats import t as student
 
-    n, mean = len(terms), float(terms.mean())
+    n, mean = len(terms), float(terms.sum()) / max(len(terms), 1)
     if n < 2 or mean <= 0.0:
         return float("nan"), 0.0, 1.0, "no failing sample"
     error = float(terms.std(ddof=1)) / math.sqrt(n)

@@ -8,6 +8,7 @@ Data: `load`, `Dataset`. Failures: `Protocol` and its makers, `corrupt`. Network
 """
 
 from fusion import evaluate, failures, lattice, losses  # noqa: F401
+from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data import Dataset, load, validation_split
 from fusion.encoders import EncoderConfig
 from fusion.failures import (
@@ -21,9 +22,9 @@ from fusion.failures import (
 from fusion.fitted import FittedARGate, finish
 from fusion.loop import Corruption, TrainingDiverged, fit, test_output
 from fusion.losses import LossConfig, LossParams, argate_loss, gate_penalty
-from fusion.models import MODELS, ModelConfig, export, init, predict
+from fusion.models import export, init, predict
 from fusion.presets import preset
-from fusion.train import HyperParams, TrainConfig, make_train
+from fusion.train import make_train
 
 __all__ = [
     "MODELS",

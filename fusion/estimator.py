@@ -9,13 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from fusion._checks import check_count, check_number
+from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data import from_arrays
 from fusion.encoders import EncoderConfig, reading_levels
 from fusion.failures import random_failing
 from fusion.fitted import FittedARGate, Prediction, finish
 from fusion.loop import Corruption, fit
-from fusion.models import ModelConfig
-from fusion.train import HyperParams, TrainConfig
 
 try:
     from sklearn.base import BaseEstimator, ClassifierMixin
@@ -37,7 +36,7 @@ class ARGateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     Args:
         model: a name in `fusion.MODELS` other than `oracle`.
         n_clean: sensors that keep working in two thirds of the training rows; half when None.
-        kind: how the others fail, see `fusion.failures.FAILURE_KINDS`.
+        kind: how the others fail, see `fusion.failure_kinds.FAILURE_KINDS`.
         epochs, batch_size, learning_rate: of the training.
         features, gate_width, head_width: sizes of the network.
         false_alarm_rate: of the sensors called failed, see `predict_sensors`.

@@ -17,9 +17,10 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from fusion._checks import check_type
+from fusion.config import ModelConfig
 from fusion.data.dataset import Dataset, Scale, apply_scale
 from fusion.loop import Corruption, test_output
-from fusion.models import ModelConfig, Params, check_windows, export, predict
+from fusion.models import Params, check_windows, export, predict
 from fusion.monitor import MonitorParams, failure_probability, fit_monitor
 from fusion.train import TrainState
 

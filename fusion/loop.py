@@ -19,17 +19,12 @@ from jaxtyping import Array, Key
 
 from fusion._checkpoints import Checkpoints, settings_of
 from fusion._checks import check_choice, check_count, check_key, check_number, check_type
+from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
-from fusion.failures import FAILURE_KINDS, FailureKind, Protocol, corrupt
-from fusion.models import ModelConfig, export
-from fusion.train import (
-    HyperParams,
-    TrainConfig,
-    TrainState,
-    init_state,
-    make_epoch,
-    predict_batches,
-)
+from fusion.failure_kinds import FAILURE_KINDS, FailureKind
+from fusion.failures import Protocol, corrupt
+from fusion.models import export
+from fusion.train import TrainState, init_state, make_epoch, predict_batches
 
 __all__ = ["Corruption", "FitResult", "TestOutput", "TrainingDiverged", "fit", "test_output"]
 

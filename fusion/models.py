@@ -8,7 +8,7 @@ Equation 3.2) exist in training only.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal, NamedTuple, cast, get_args
+from typing import Any, NamedTuple, cast
 
 import flax.linen as nn
 import jax
@@ -16,35 +16,24 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from fusion._checks import (
-    check_choice,
-    check_count,
-    check_counts,
     check_key,
-    check_number,
-    check_type,
 )
-from fusion.encoders import EncoderConfig, encoder, stacked_dense
+from fusion.config import ModelConfig
+from fusion.encoders import encoder, stacked_dense
 from fusion.gating import (
-    Fusion,
     Gate,
-    Normalizer,
-    Scaling,
     apply_weights,
     available_weights,
     drop_modalities,
     embrace,
     oracle_weights,
 )
-from fusion.losses import LossConfig
-from fusion.targets import TargetConfig, init_targets
+from fusion.targets import init_targets
 
 __all__ = [
-    "MODELS",
     "AuxiliaryPaths",
     "FusionNet",
     "MainOutput",
-    "ModelConfig",
-    "Recipe",
     "auxiliary_logits",
     "check_windows",
     "count_parameters",
@@ -55,114 +44,6 @@ __all__ = [
 ]
 
 Params = dict[str, Any]
-
-
-@dataclasses.dataclass(frozen=True)
-class Recipe:
-    """What sets one model apart from the others.
-
-    Attributes:
-        gate: where the fusion weights come from; `"none"` is plain late fusion.
-        loss: which terms of the loss it has: auxiliary paths (WS), weighted (ALW), targets (FWR).
-        modality_dropout: probability that a sensor's features are dropped in training.
-    """
-
-    gate: Literal["none", "learned", "oracle", "embrace"]
-    loss: LossConfig
-    modality_dropout: float = 0.0
-
-
-_MAIN = LossConfig(
-    auxiliary=False, loss_weighting=False, regularization=False, learned_targets=False
-)
-_PATHS = dataclasses.replace(_MAIN, auxiliary=True)
-
-MODELS: dict[str, Recipe] = {
-    "baseline": Recipe("none", _MAIN),
-    "netgated": Recipe("learned", _MAIN),
-    "argate_ws": Recipe("learned", _PATHS),
-    "argate_plus": Recipe("learned", LossConfig(learned_targets=False)),
-    "argate_l": Recipe("learned", LossConfig()),
-    "modality_dropout": Recipe("none", _MAIN, modality_dropout=0.2),
-    "embracenet": Recipe("embrace", _MAIN),
-    "oracle": Recipe("oracle", _PATHS),
-}
-"""The models by name. The first five are the source's; the others are references."""
-
-
-@dataclasses.dataclass(frozen=True)
-class ModelConfig:
-    """A network, completely: what it is (`model`), what it reads, how wide it is.
-
-    Attributes:
-        model: a name in `MODELS`.
-        n_sensors, n_times, n_classes: shape of the problem.
-        encoder: the unisensory encoders.
-        gate_width: hidden units of the FC-con block.
-        head_widths: hidden layers after fusion; `match_parameters` moves the first.
-        aux_width: hidden units of each auxiliary head; 0 for a linear head.
-        embrace_width: width that EmbraceNet docks each sensor's features to before it draws.
-        dropout: rate after fusion and in the head, in training.
-        fusion: `"concat"` keeps each sensor's features apart, `"sum"` adds them.
-        scale: `"mean"` multiplies weights by K, `"max"` divides them by the largest.
-        normalizer: of the fusion weights, see `fusion.gating.normalize`.
-        weight_sharing: auxiliary paths share the encoders; else they have their own (ablation).
-        loss: terms of the loss and its gradient paths; None for those of the model's recipe.
-        targets: the lattice of Equation 3.2.
-    """
-
-    model: str = "argate_l"
-    n_sensors: int = 9
-    n_times: int = 128
-    n_classes: int = 6
-    encoder: EncoderConfig = dataclasses.field(default_factory=EncoderConfig)
-    gate_width: int = 32
-    head_widths: tuple[int, ...] = (128,)
-    aux_width: int = 0
-    embrace_width: int = 128
-    dropout: float = 0.2
-    fusion: Fusion = "concat"
-    scale: Scaling = "mean"
-    normalizer: Normalizer = "softmax"
-    weight_sharing: bool = True
-    loss: LossConfig | None = None
-    targets: TargetConfig = dataclasses.field(default_factory=TargetConfig)
-
-    def __post_init__(self) -> None:
-        """Refuse what cannot be built, by name and value."""
-        check_choice("model", self.model, MODELS)
-        for name, options in (("fusion", Fusion), ("scale", Scaling), ("normalizer", Normalizer)):
-            check_choice(name, getattr(self, name), get_args(options))
-        check_choice("weight_sharing", self.weight_sharing, (True, False))
-        check_number("dropout", self.dropout, 0.0, 1.0, below=True, fix="it is a rate")
-        for name in ("n_sensors", "n_times", "gate_width", "embrace_width"):
-            check_count(name, getattr(self, name))
-        check_count("n_classes", self.n_classes, 2)
-        check_count("aux_width", self.aux_width, 0)
-        check_counts("head_widths", self.head_widths)
-        check_type("encoder", self.encoder, EncoderConfig, "build an EncoderConfig")
-        check_type("targets", self.targets, TargetConfig, "build a TargetConfig")
-        if self.encoder.levels and len(self.encoder.levels) != self.n_sensors:
-            raise ValueError(
-                f"encoder.levels={len(self.encoder.levels)} rows: expected one for each of "
-                f"{self.n_sensors} sensors; make levels with reading_levels"
-            )
-        if self.loss is None:
-            return
-        check_type("loss", self.loss, LossConfig, "build a LossConfig")
-        gate = MODELS[self.model].gate
-        for name in ("loss_weighting", "regularization"):
-            if getattr(self.loss, name) and gate != "learned":
-                raise ValueError(
-                    f"loss.{name}=True: expected a model with a learned gate, {self.model!r} has "
-                    f"none; use loss.{name}=False"
-                )
-
-    @property
-    def recipe(self) -> Recipe:
-        """The model's recipe, with the loss of this config where it has one."""
-        base = MODELS[self.model]
-        return base if self.loss is None else dataclasses.replace(base, loss=self.loss)
 
 
 class MainOutput(NamedTuple):

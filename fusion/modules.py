@@ -75,7 +75,7 @@ class ARGate(nn.Module):
         targets: of the fusion weights, a module from losses to targets such as `LatticeTargets`;
             None for the fixed targets of `fusion.losses.loss_targets`.
         gate_width: hidden units of the gate.
-        normalizer, fusion, scale: see `fusion.models.ModelConfig`.
+        normalizer, fusion, scale: see `fusion.config.ModelConfig`.
 
     Source: Shim (2020), section 3.2 and Figures 3.1 and 3.3.
 

@@ -16,8 +16,9 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from fusion._checks import check_choice, check_key, check_number
-from fusion.failures import FAILURE_KINDS, FailureKind, apply_failure
-from fusion.models import ModelConfig, Params, predict
+from fusion.config import ModelConfig
+from fusion.failure_kinds import FAILURE_KINDS, FailureKind, apply_failure
+from fusion.models import Params, predict
 
 __all__ = ["MonitorParams", "failure_probability", "fit_monitor"]
 

@@ -6,11 +6,11 @@ import dataclasses
 from typing import NamedTuple
 
 from fusion._checks import check_choice
+from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
 from fusion.encoders import EncoderConfig, reading_levels
 from fusion.losses import LossParams
-from fusion.models import MODELS, ModelConfig, match_parameters
-from fusion.train import HyperParams, TrainConfig
+from fusion.models import match_parameters
 
 __all__ = ["PRESETS", "Preset", "preset"]
 
@@ -64,7 +64,7 @@ def preset(dataset: Dataset, model: str = "argate_l", name: str = "paper") -> Pr
 
     Args:
         dataset: gives the sizes.
-        model: a name in `fusion.models.MODELS`.
+        model: a name in `fusion.config.MODELS`.
         name: `"paper"` for the record, `"quick"` for the same with few epochs.
 
     Returns:

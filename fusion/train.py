@@ -6,25 +6,24 @@ around them: corruption, checkpoints, resume, and a clear stop on a loss that is
 
 from __future__ import annotations
 
-import dataclasses
-from collections.abc import Callable, Iterable
-from typing import Any, Literal, NamedTuple, get_args
+from collections.abc import Callable
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from fusion._checks import check_choice, check_count, check_key, check_number
-from fusion.failures import FAILURE_KINDS, FailureKind, Protocol, corrupt
-from fusion.losses import LossParams, LossTerms, argate_loss, cross_entropy
-from fusion.models import MainOutput, ModelConfig, Params, auxiliary_logits, init, predict
+from fusion._checks import check_choice, check_count, check_key
+from fusion.config import HyperParams, ModelConfig, TrainConfig
+from fusion.failure_kinds import FAILURE_KINDS, FailureKind
+from fusion.failures import Protocol, corrupt
+from fusion.losses import LossTerms, argate_loss, cross_entropy
+from fusion.models import MainOutput, Params, auxiliary_logits, init, predict
 from fusion.targets import apply_targets, project_targets
 
 __all__ = [
     "EpochMetrics",
-    "HyperParams",
-    "TrainConfig",
     "TrainState",
     "batch_loss",
     "init_state",
@@ -33,76 +32,6 @@ __all__ = [
     "predict_batches",
     "train_step",
 ]
-
-
-Schedule = Literal["cosine", "constant"]
-
-
-class _HyperParams(NamedTuple):
-    learning_rate: float | Array = 2e-3
-    weight_decay: float | Array = 1e-3
-    loss: LossParams = LossParams()
-
-
-class HyperParams(_HyperParams):
-    """What a sweep may vary; scalars, so `jax.vmap` runs over them without recompiling.
-
-    Attributes:
-        learning_rate: of Adam, >= 0; the start of the schedule.
-        weight_decay: decoupled, >= 0.
-        loss: weights of the terms of the loss.
-
-    Raises:
-        ValueError: a number out of its range. Arrays and traced values are not looked at.
-
-    Example:
-        >>> HyperParams(1e-2).weight_decay
-        0.001
-    """
-
-    __slots__ = ()
-
-    def __new__(
-        cls,
-        learning_rate: Any = 2e-3,
-        weight_decay: Any = 1e-3,
-        loss: Any = LossParams(),  # noqa: B008
-    ) -> HyperParams:
-        """Check the numbers that are given as numbers."""
-        check_number("learning_rate", learning_rate, 0.0, fix="2e-3 is usual")
-        check_number("weight_decay", weight_decay, 0.0, fix="0 turns it off")
-        return super().__new__(cls, learning_rate, weight_decay, loss)
-
-    @classmethod
-    def _make(cls, iterable: Iterable[Any]) -> HyperParams:
-        return cls(*iterable)
-
-
-@dataclasses.dataclass(frozen=True)
-class TrainConfig:
-    """What recompiles: sizes and choices of the training run.
-
-    Attributes:
-        epochs: passes over the training set; also the length of the cosine schedule.
-        batch_size: examples per step; the rest of an epoch that fills no batch is left out.
-        schedule: of the learning rate, `"cosine"` to zero or `"constant"`.
-        clip_norm: bound of the gradient's global norm.
-        jitter: standard deviation of a random gain per channel and example, in training.
-    """
-
-    epochs: int = 20
-    batch_size: int = 64
-    schedule: Schedule = "cosine"
-    clip_norm: float = 5.0
-    jitter: float = 0.0
-
-    def __post_init__(self) -> None:
-        """Refuse sizes that make no run."""
-        for name in ("epochs", "batch_size"):
-            check_count(name, getattr(self, name))
-        check_choice("schedule", self.schedule, get_args(Schedule))
-        check_number("clip_norm", self.clip_norm, 0.0, above=True, fix="1e9 clips nothing")
-        check_number("jitter", self.jitter, 0.0, fix="0 turns it off")
 
 
 class TrainState(NamedTuple):

@@ -195,7 +195,7 @@ def train_epoch(
 
     Args:
         net, optimizer: to train; the optimizer is `torch.optim.AdamW`.
-        config: a `fusion.train.TrainConfig`; terms: a `fusion.losses.LossConfig`.
+        config: a `fusion.config.TrainConfig`; terms: a `fusion.losses.LossConfig`.
         rate: learning rate of a step.
     """
     step = 0

@@ -66,7 +66,7 @@ def snn() -> str:
 
 def argate() -> str:
     """ARGate: main path, gate, auxiliary paths and targets."""
-    from fusion.models import ModelConfig
+    from fusion.config import ModelConfig
 
     config = ModelConfig()
     canvas = Canvas(980, 420, "ARGate: encoders, gate, fusion; auxiliary losses steer the gate")

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any
 from snn_fusion_failure.records.rows import summarize
 
 if TYPE_CHECKING:
-    from fusion.failures import FailureKind
+    from fusion.failure_kinds import FailureKind
 
 FIVE = ("baseline", "netgated", "argate_ws", "argate_plus", "argate_l")
 REFERENCES = ("oracle", "modality_dropout", "embracenet")

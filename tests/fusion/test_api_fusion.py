@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion import encoders, failures, gating, losses, targets
+from fusion import encoders, failure_kinds, failures, gating, losses, targets
 from fusion.detection.geometry import encodings, overlaps, suppression
 from fusion.detection.learning import detection_loss
 from fusion.detection.network import crop
@@ -189,6 +189,22 @@ CASES = [
         (0, 1, 3, 4, 5),
     ),
     Case(
+        "losses.gate_penalty",
+        lambda p, w, a, t: losses.gate_penalty(losses.LossConfig(stop_targets=False), p, w, a, t),
+        lambda rng: (
+            LOSS,
+            shares(rng, 4, 2),
+            *f32(rng.uniform(0.2, 2.0, (4, 2))),
+            shares(rng, 4, 2),
+        ),
+        (0, 1, 2, 3),
+    ),
+    Case(
+        "gating.available_weights",
+        gating.available_weights,
+        lambda rng: (shares(rng, 4, 3), rng.random((4, 3)) < 0.7),
+    ),
+    Case(
         "targets.apply_targets",
         lambda x: targets.apply_targets(TARGETS, _target_params(), x) ** 2,
         lambda rng: f32(rng.uniform(0.1, 3.0, (4, 2))),
@@ -208,8 +224,10 @@ CASES = [
     ),
     *(
         Case(
-            f"failures.apply_failure ({kind})",
-            lambda k, x, m, s, kind=kind: failures.apply_failure(x, m, kind, key=k, severity=s),
+            f"failure_kinds.apply_failure ({kind})",
+            lambda k, x, m, s, kind=kind: failure_kinds.apply_failure(
+                x, m, kind, key=k, severity=s
+            ),
             lambda rng: (
                 key(rng),
                 *f32(rng.uniform(-0.9, 0.9, (3, 2, 8))),

@@ -18,12 +18,11 @@ import pytest
 
 import fusion
 from fusion import failures, gating
+from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data import check_dataset
 from fusion.loop import Corruption
 from fusion.losses import LossConfig, LossParams
-from fusion.models import ModelConfig
 from fusion.targets import TargetConfig
-from fusion.train import HyperParams, TrainConfig
 
 CHANNELS = ("a", "b", "c")
 CLEAN = failures.no_failure(CHANNELS)

@@ -14,10 +14,9 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import stats
 
+from fusion.failure_kinds import FAILURE_KINDS, apply_failure
 from fusion.failures import (
-    FAILURE_KINDS,
     Protocol,
-    apply_failure,
     corrupt,
     draw_mask,
     fixed_failing,

@@ -10,14 +10,14 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data import from_arrays, validation_split
 from fusion.data.dataset import Dataset
 from fusion.encoders import EncoderConfig, reading_levels
 from fusion.failures import random_failing
 from fusion.fitted import FittedARGate, finish
 from fusion.loop import Corruption, fit
-from fusion.models import MODELS, ModelConfig, export, init, predict
-from fusion.train import HyperParams, TrainConfig
+from fusion.models import export, init, predict
 
 # optax's Adam raises a float to an integer power, which strict promotion forbids.
 pytestmark = pytest.mark.relaxed

@@ -10,11 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fusion.config import MODELS, ModelConfig
 from fusion.encoders import EncoderConfig
 from fusion.losses import LossConfig
 from fusion.models import (
-    MODELS,
-    ModelConfig,
     auxiliary_logits,
     count_parameters,
     export,

@@ -10,6 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
+from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data import Dataset
 from fusion.data.dataset import Scale
 from fusion.encoders import EncoderConfig
@@ -17,10 +18,10 @@ from fusion.evaluate import gate_auroc, split_accuracy
 from fusion.failures import no_failure, random_failing
 from fusion.loop import Corruption, TrainingDiverged, fit, test_output
 from fusion.losses import LossConfig, LossParams
-from fusion.models import ModelConfig, export
+from fusion.models import export
 from fusion.presets import preset
 from fusion.targets import check_targets
-from fusion.train import HyperParams, TrainConfig, make_epoch, make_train, predict_batches
+from fusion.train import make_epoch, make_train, predict_batches
 
 # optax's Adam raises a float to an integer power, which strict promotion forbids.
 pytestmark = pytest.mark.relaxed

@@ -1,6 +1,6 @@
 """Study `argate`: train a sensor-fusion network, score it on corrupted validation rows.
 
-Axes are the leaves of `fusion.train.HyperParams`: `learning_rate`, `weight_decay`, `loss.alpha`,
+Axes are the leaves of `fusion.config.HyperParams`: `learning_rate`, `weight_decay`, `loss.alpha`,
 `loss.beta`, `loss.tau`, `loss.anchor`. Held-out training rows are scored, never the test rows: a
 sweep chooses, and what is chosen on test rows cannot be reported on them.
 """

@@ -1,0 +1,195 @@
+"""What a network and its training are: static configurations, and numbers that may be traced."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Iterable
+from typing import Any, Literal, NamedTuple, get_args
+
+from jaxtyping import Array
+
+from fusion._checks import check_choice, check_count, check_counts, check_number, check_type
+from fusion.encoders import EncoderConfig
+from fusion.gating import Fusion, Normalizer, Scaling
+from fusion.losses import LossConfig, LossParams
+from fusion.targets import TargetConfig
+
+__all__ = ["MODELS", "HyperParams", "ModelConfig", "Recipe", "TrainConfig"]
+
+
+@dataclasses.dataclass(frozen=True)
+class Recipe:
+    """What sets one model apart from the others.
+
+    Attributes:
+        gate: where the fusion weights come from; `"none"` is plain late fusion.
+        loss: which terms of the loss it has: auxiliary paths (WS), weighted (ALW), targets (FWR).
+        modality_dropout: probability that a sensor's features are dropped in training.
+    """
+
+    gate: Literal["none", "learned", "oracle", "embrace"]
+    loss: LossConfig
+    modality_dropout: float = 0.0
+
+
+_MAIN = LossConfig(
+    auxiliary=False, loss_weighting=False, regularization=False, learned_targets=False
+)
+_PATHS = dataclasses.replace(_MAIN, auxiliary=True)
+
+MODELS: dict[str, Recipe] = {
+    "baseline": Recipe("none", _MAIN),
+    "netgated": Recipe("learned", _MAIN),
+    "argate_ws": Recipe("learned", _PATHS),
+    "argate_plus": Recipe("learned", LossConfig(learned_targets=False)),
+    "argate_l": Recipe("learned", LossConfig()),
+    "modality_dropout": Recipe("none", _MAIN, modality_dropout=0.2),
+    "embracenet": Recipe("embrace", _MAIN),
+    "oracle": Recipe("oracle", _PATHS),
+}
+"""The models by name. The first five are the source's; the others are references."""
+
+
+@dataclasses.dataclass(frozen=True)
+class ModelConfig:
+    """A network, completely: what it is (`model`), what it reads, how wide it is.
+
+    Attributes:
+        model: a name in `MODELS`.
+        n_sensors, n_times, n_classes: shape of the problem.
+        encoder: the unisensory encoders.
+        gate_width: hidden units of the FC-con block.
+        head_widths: hidden layers after fusion; `match_parameters` moves the first.
+        aux_width: hidden units of each auxiliary head; 0 for a linear head.
+        embrace_width: width that EmbraceNet docks each sensor's features to before it draws.
+        dropout: rate after fusion and in the head, in training.
+        fusion: `"concat"` keeps each sensor's features apart, `"sum"` adds them.
+        scale: `"mean"` multiplies weights by K, `"max"` divides them by the largest.
+        normalizer: of the fusion weights, see `fusion.gating.normalize`.
+        weight_sharing: auxiliary paths share the encoders; else they have their own (ablation).
+        loss: terms of the loss and its gradient paths; None for those of the model's recipe.
+        targets: the lattice of Equation 3.2.
+    """
+
+    model: str = "argate_l"
+    n_sensors: int = 9
+    n_times: int = 128
+    n_classes: int = 6
+    encoder: EncoderConfig = dataclasses.field(default_factory=EncoderConfig)
+    gate_width: int = 32
+    head_widths: tuple[int, ...] = (128,)
+    aux_width: int = 0
+    embrace_width: int = 128
+    dropout: float = 0.2
+    fusion: Fusion = "concat"
+    scale: Scaling = "mean"
+    normalizer: Normalizer = "softmax"
+    weight_sharing: bool = True
+    loss: LossConfig | None = None
+    targets: TargetConfig = dataclasses.field(default_factory=TargetConfig)
+
+    def __post_init__(self) -> None:
+        """Refuse what cannot be built, by name and value."""
+        check_choice("model", self.model, MODELS)
+        for name, options in (("fusion", Fusion), ("scale", Scaling), ("normalizer", Normalizer)):
+            check_choice(name, getattr(self, name), get_args(options))
+        check_choice("weight_sharing", self.weight_sharing, (True, False))
+        check_number("dropout", self.dropout, 0.0, 1.0, below=True, fix="it is a rate")
+        for name in ("n_sensors", "n_times", "gate_width", "embrace_width"):
+            check_count(name, getattr(self, name))
+        check_count("n_classes", self.n_classes, 2)
+        check_count("aux_width", self.aux_width, 0)
+        check_counts("head_widths", self.head_widths)
+        check_type("encoder", self.encoder, EncoderConfig, "build an EncoderConfig")
+        check_type("targets", self.targets, TargetConfig, "build a TargetConfig")
+        if self.encoder.levels and len(self.encoder.levels) != self.n_sensors:
+            raise ValueError(
+                f"encoder.levels={len(self.encoder.levels)} rows: expected one for each of "
+                f"{self.n_sensors} sensors; make levels with reading_levels"
+            )
+        if self.loss is None:
+            return
+        check_type("loss", self.loss, LossConfig, "build a LossConfig")
+        gate = MODELS[self.model].gate
+        for name in ("loss_weighting", "regularization"):
+            if getattr(self.loss, name) and gate != "learned":
+                raise ValueError(
+                    f"loss.{name}=True: expected a model with a learned gate, {self.model!r} has "
+                    f"none; use loss.{name}=False"
+                )
+
+    @property
+    def recipe(self) -> Recipe:
+        """The model's recipe, with the loss of this config where it has one."""
+        base = MODELS[self.model]
+        return base if self.loss is None else dataclasses.replace(base, loss=self.loss)
+
+
+Schedule = Literal["cosine", "constant"]
+
+
+class _HyperParams(NamedTuple):
+    learning_rate: float | Array = 2e-3
+    weight_decay: float | Array = 1e-3
+    loss: LossParams = LossParams()
+
+
+class HyperParams(_HyperParams):
+    """What a sweep may vary; scalars, so `jax.vmap` runs over them without recompiling.
+
+    Attributes:
+        learning_rate: of Adam, >= 0; the start of the schedule.
+        weight_decay: decoupled, >= 0.
+        loss: weights of the terms of the loss.
+
+    Raises:
+        ValueError: a number out of its range. Arrays and traced values are not looked at.
+
+    Example:
+        >>> HyperParams(1e-2).weight_decay
+        0.001
+    """
+
+    __slots__ = ()
+
+    def __new__(
+        cls,
+        learning_rate: Any = 2e-3,
+        weight_decay: Any = 1e-3,
+        loss: Any = LossParams(),  # noqa: B008
+    ) -> HyperParams:
+        """Check the numbers that are given as numbers."""
+        check_number("learning_rate", learning_rate, 0.0, fix="2e-3 is usual")
+        check_number("weight_decay", weight_decay, 0.0, fix="0 turns it off")
+        return super().__new__(cls, learning_rate, weight_decay, loss)
+
+    @classmethod
+    def _make(cls, iterable: Iterable[Any]) -> HyperParams:
+        return cls(*iterable)
+
+
+@dataclasses.dataclass(frozen=True)
+class TrainConfig:
+    """What recompiles: sizes and choices of the training run.
+
+    Attributes:
+        epochs: passes over the training set; also the length of the cosine schedule.
+        batch_size: examples per step; the rest of an epoch that fills no batch is left out.
+        schedule: of the learning rate, `"cosine"` to zero or `"constant"`.
+        clip_norm: bound of the gradient's global norm.
+        jitter: standard deviation of a random gain per channel and example, in training.
+    """
+
+    epochs: int = 20
+    batch_size: int = 64
+    schedule: Schedule = "cosine"
+    clip_norm: float = 5.0
+    jitter: float = 0.0
+
+    def __post_init__(self) -> None:
+        """Refuse sizes that make no run."""
+        for name in ("epochs", "batch_size"):
+            check_count(name, getattr(self, name))
+        check_choice("schedule", self.schedule, get_args(Schedule))
+        check_number("clip_norm", self.clip_norm, 0.0, above=True, fix="1e9 clips nothing")
+        check_number("jitter", self.jitter, 0.0, fix="0 turns it off")

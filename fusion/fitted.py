@@ -4,18 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 import functools
-import json
-import os
-import tempfile
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, NamedTuple, get_type_hints
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
+from fusion._array_files import build, flatten, read_arrays, unflatten, write_arrays
 from fusion._checks import check_type
 from fusion.config import ModelConfig
 from fusion.data.dataset import Dataset, Scale, apply_scale
@@ -141,8 +139,7 @@ class FittedARGate:
 
     def save(self, path: str | Path) -> None:
         """Write one `.npz` file without pickled objects; a reader sees the old file or the new."""
-        path = Path(path)
-        arrays = {f"params/{name}": value for name, value in _flatten(self.params).items()}
+        arrays = {f"params/{name}": value for name, value in flatten(self.params).items()}
         arrays |= {f"monitor/{n}": np.asarray(v) for n, v in self.monitor._asdict().items()}
         arrays |= {"scale/low": self.scale.low, "scale/high": self.scale.high}
         header = {
@@ -153,16 +150,7 @@ class FittedARGate:
             "false_alarm_rate": self.false_alarm_rate,
             "temperature": self.temperature,
         }
-        arrays["header"] = np.frombuffer(json.dumps(header).encode(), np.uint8)
-        path.parent.mkdir(parents=True, exist_ok=True)
-        handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(handle, "wb") as file:
-                np.savez(file, **arrays)
-            os.replace(temporary, path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        write_arrays(Path(path), header, arrays)
 
     @classmethod
     def load(cls, path: str | Path) -> FittedARGate:
@@ -172,13 +160,7 @@ class FittedARGate:
             FileNotFoundError: it is not there.
             ValueError: it is no such file, or one of a later version.
         """
-        with np.load(path, allow_pickle=False) as file:
-            if "header" not in file:
-                raise ValueError(
-                    f"path={str(path)!r}: expected a file of FittedARGate.save; check it"
-                )
-            held = {name: file[name] for name in file.files}
-        header = json.loads(held.pop("header").tobytes())
+        header, held = read_arrays(Path(path))
         if header["format"] != FORMAT:
             raise ValueError(
                 f"path={str(path)!r} of format {header['format']}: expected format {FORMAT}; "
@@ -189,8 +171,8 @@ class FittedARGate:
             part, _, rest = name.partition("/")
             parts[part][rest] = value
         return cls(
-            config=_build(ModelConfig, header["config"]),
-            params=_unflatten(parts["params"]),
+            config=build(ModelConfig, header["config"]),
+            params=unflatten(parts["params"]),
             scale=Scale(**parts["scale"]),
             channels=tuple(header["channels"]),
             classes=tuple(header["classes"]),
@@ -198,41 +180,6 @@ class FittedARGate:
             false_alarm_rate=header["false_alarm_rate"],
             temperature=header["temperature"],
         )
-
-
-def _flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:
-    if not isinstance(tree, dict):
-        return {prefix: np.asarray(tree)}
-    return {
-        name: value
-        for key, branch in tree.items()
-        for name, value in _flatten(branch, f"{prefix}/{key}" if prefix else key).items()
-    }
-
-
-def _unflatten(flat: dict[str, np.ndarray]) -> Params:
-    tree: dict[str, Any] = {}
-    for name, value in flat.items():
-        *path, last = name.split("/")
-        branch = tree
-        for key in path:
-            branch = branch.setdefault(key, {})
-        branch[last] = jnp.asarray(value)
-    return tree
-
-
-def _build(kind: Any, values: Any) -> Any:
-    """A frozen dataclass from the JSON of `dataclasses.asdict`; lists become tuples."""
-    if isinstance(values, list):
-        return tuple(_build(None, value) for value in values)
-    if not isinstance(values, dict):
-        return values
-    made = {}
-    for name, hint in get_type_hints(kind).items():
-        # `LossConfig | None` holds a LossConfig where the value is a mapping.
-        inner = (k for k in (hint, *getattr(hint, "__args__", ())) if dataclasses.is_dataclass(k))
-        made[name] = _build(next(inner, None), values[name])
-    return kind(**made)
 
 
 def _temperature(logits: Float[np.ndarray, "n c"], labels: np.ndarray) -> float:

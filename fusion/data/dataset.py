@@ -8,6 +8,8 @@ from typing import Any
 
 import numpy as np
 
+from fusion._checks import check_number
+
 __all__ = [
     "Dataset",
     "Scale",
@@ -203,8 +205,7 @@ def draw_groups(
         >>> draw_groups(np.arange(10), np.zeros(10, int), fraction=0.2, seed=0).size
         2
     """
-    if not 0.0 < fraction < 1.0:
-        raise ValueError(f"fraction is {fraction}, expected a share in (0, 1), such as 0.2")
+    check_number("fraction", fraction, 0.0, 1.0, above=True, below=True, fix="0.2 is usual")
     rng = np.random.default_rng(seed)
     ids = np.unique(groups)
     classes_of = {int(g): np.unique(labels[groups == g]) for g in ids}
@@ -250,13 +251,15 @@ def validation_split(
     Raises:
         ValueError: fraction outside (0, 1); unknown group ids; a class without training rows left.
     """
-    if groups is None and not 0.0 < fraction < 1.0:
-        raise ValueError(f"fraction is {fraction}, expected a share in (0, 1), such as 0.2")
+    if groups is None:
+        check_number("fraction", fraction, 0.0, 1.0, above=True, below=True, fix="0.2 is usual")
     known = np.unique(dataset.train_group)
     if groups is not None:
         unknown = sorted(set(map(int, groups)) - set(known.tolist()))
         if unknown or len(groups) == 0:
-            raise ValueError(f"groups {unknown or 'is empty'}: expected some of {known.tolist()}")
+            raise ValueError(
+                f"groups={list(groups)}: expected some of {known.tolist()}; leave the others out"
+            )
         held = np.isin(dataset.train_group, np.asarray(groups))
     elif dataset.split == "random":
         n = dataset.train_y.size

@@ -13,6 +13,7 @@ from typing import Literal, get_args
 
 import numpy as np
 
+from fusion._checks import check_choice
 from fusion.data.dataset import Dataset, apply_scale, check_dataset, draw_groups, fit_scale
 from fusion.data.locate import locate, missing_message
 
@@ -211,12 +212,8 @@ def load_driver(
 
     Deviation: the publisher's file could not be read for its checksum, so there is no download.
     """
-    if split not in get_args(DriverSplit):
-        raise ValueError(f"split is {split!r}, expected one of {list(get_args(DriverSplit))}")
-    if features not in get_args(DriverFeatures):
-        raise ValueError(
-            f"features is {features!r}, expected one of {list(get_args(DriverFeatures))}"
-        )
+    check_choice("split", split, get_args(DriverSplit))
+    check_choice("features", features, get_args(DriverFeatures))
     path = locate("driver", DRIVER_FILES, data_dir)
     if path is None:
         remedy = (

@@ -67,7 +67,7 @@ def published_fixed(
     if n_clean not in sets:
         known = sorted(sets) or "none"
         raise ValueError(
-            f"no fixed failing set with n_clean={n_clean} is published for {dataset.name!r} "
-            f"(known: {known}); name the channels with fusion.failures.fixed_failing"
+            f"n_clean={n_clean}: expected one of {known}, the fixed failing sets published for "
+            f"{dataset.name!r}; name the channels with fusion.fixed_failing"
         )
     return fixed_failing(dataset.channels, sets[n_clean], clean_fraction=clean_fraction)

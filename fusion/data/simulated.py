@@ -21,6 +21,7 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from fusion._checks import check_count, check_number
 from fusion.data.dataset import Dataset, apply_scale, check_dataset, fit_scale
 from fusion.failures import Protocol
 
@@ -55,25 +56,16 @@ class SimulatedConfig:
 
     def __post_init__(self) -> None:
         """Check every field."""
-        for name, low in (("n_channels", 1), ("n_classes", 2)):
-            if getattr(self, name) < low:
-                raise ValueError(f"{name} is {getattr(self, name)}, expected at least {low}")
+        check_count("n_channels", self.n_channels)
+        check_count("n_classes", self.n_classes, 2)
         for name in ("n_train", "n_test"):
-            if getattr(self, name) < self.n_classes:
-                raise ValueError(
-                    f"{name} is {getattr(self, name)}, expected at least n_classes={self.n_classes}"
-                )
-        if self.n_time <= 2 * (self.n_classes + FIRST_CYCLES):
-            raise ValueError(
-                f"n_time is {self.n_time}: {self.n_classes} rhythms need more than "
-                f"{2 * (self.n_classes + FIRST_CYCLES)} samples a window"
-            )
-        if not 0.0 <= self.correlation < 1.0:
-            raise ValueError(f"correlation is {self.correlation}, expected [0, 1)")
-        if not 0.0 < self.gain[0] <= self.gain[1]:
-            raise ValueError(f"gain is {self.gain}, expected 0 < weakest <= strongest")
-        if self.floor < 0.0:
-            raise ValueError(f"floor is {self.floor}, expected a standard deviation >= 0")
+            check_count(name, getattr(self, name), self.n_classes)
+        check_count("n_time", self.n_time, 2 * (self.n_classes + FIRST_CYCLES) + 1)
+        check_number("correlation", self.correlation, 0.0, 1.0, below=True)
+        weakest, strongest = self.gain
+        check_number("gain[0]", weakest, 0.0, above=True, fix="an amplitude is positive")
+        check_number("gain[1]", strongest, weakest, fix="give (weakest, strongest)")
+        check_number("floor", self.floor, 0.0, fix="it is a standard deviation")
 
     @property
     def gains(self) -> np.ndarray:
@@ -186,7 +178,10 @@ def oracle_accuracy(config: SimulatedConfig, protocol: Protocol) -> float:
     """
     k = config.n_channels
     if protocol.n_channels != k:
-        raise ValueError(f"the protocol is for {protocol.n_channels} channels, the config has {k}")
+        raise ValueError(
+            f"protocol.n_channels={protocol.n_channels}: expected {k} as in the config; build the "
+            "protocol from the channels of the set"
+        )
     if protocol.failing:
         corrupted = bayes_accuracy(config, sorted(set(range(k)) - set(protocol.failing)))
     else:

@@ -224,9 +224,9 @@ def test_a_signal_missing_for_a_trip_is_refused(
 
 
 def test_bad_options(tmp_path: Path) -> None:
-    with pytest.raises(ValueError, match=r"split is 'rows', expected one of \['random', 'trip'\]"):
+    with pytest.raises(ValueError, match=r"split='rows': expected one of 'random', 'trip'"):
         load_driver(tmp_path, split="rows")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"expected one of \['complete', 'source'\]"):
+    with pytest.raises(ValueError, match=r"expected one of 'complete', 'source'"):
         load_driver(tmp_path, features="all")  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match=r"no download: ask the publisher"):
         load_driver(tmp_path)

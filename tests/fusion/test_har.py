@@ -283,8 +283,12 @@ def test_download_is_checked_and_kept(
 @pytest.mark.parametrize(
     ("name", "split", "expected"),
     [
-        ("hra", None, r"'hra' is unknown, expected one of \['har', 'driver', 'simulated'\]"),
-        ("har", "random", r"'random' is unknown for 'har', expected one of \['subject'\]"),
+        (
+            "hra",
+            None,
+            r"name='hra': expected one of 'har'.*did you mean 'har'",
+        ),
+        ("har", "random", r"split='random': expected one of 'subject'"),
     ],
 )
 def test_unknown_names_list_the_known_ones(name: str, split: str | None, expected: str) -> None:

@@ -100,7 +100,7 @@ def test_oracle_accuracy_is_the_mean_over_failing_sets() -> None:
     assert oracle_accuracy(config, fixed) == pytest.approx(
         (whole + bayes_accuracy(config, [0, 2])) / 2
     )
-    with pytest.raises(ValueError, match="for 3 channels, the config has 6"):
+    with pytest.raises(ValueError, match=r"protocol.n_channels=3: expected 6"):
         oracle_accuracy(CONFIG, fixed)
 
 
@@ -119,11 +119,11 @@ def test_validation_split_holds_out_whole_groups() -> None:
     data = load_simulated(SimulatedConfig(n_train=100, n_test=8))
     part = validation_split(data)
     assert len(part.test_y) == 20 and not set(part.test_group) & set(part.train_group)
-    with pytest.raises(ValueError, match=r"fraction is 1.5, expected a share in \(0, 1\)"):
+    with pytest.raises(ValueError, match=r"fraction=1.5: expected a number in \(0, 1\)"):
         validation_split(data, fraction=1.5)
     with pytest.raises(ValueError, match="both parts need rows"):
         validation_split(data, groups=range(10))
-    with pytest.raises(ValueError, match="no fixed failing set with n_clean=3"):
+    with pytest.raises(ValueError, match=r"n_clean=3: expected one of"):
         published_fixed(data, 3)
 
 
@@ -140,13 +140,13 @@ def test_groups_of_one_class_are_drawn_class_by_class() -> None:
 @pytest.mark.parametrize(
     ("changes", "expected"),
     [
-        ({"n_channels": 0}, "n_channels is 0"),
-        ({"n_classes": 1}, "n_classes is 1"),
-        ({"n_train": 3}, "n_train is 3, expected at least n_classes=4"),
-        ({"n_time": 12}, "more than 12 samples"),
+        ({"n_channels": 0}, "n_channels=0"),
+        ({"n_classes": 1}, "n_classes=1"),
+        ({"n_train": 3}, "n_train=3: expected a whole number of at least 4"),
+        ({"n_time": 12}, "n_time=12: expected a whole number of at least 13"),
         ({"correlation": 1.0}, r"expected \[0, 1\)"),
-        ({"gain": (2.0, 1.0)}, "weakest <= strongest"),
-        ({"floor": -0.1}, "floor is -0.1"),
+        ({"gain": (2.0, 1.0)}, "weakest, strongest"),
+        ({"floor": -0.1}, "floor=-0.1"),
     ],
 )
 def test_config_is_checked(changes: dict, expected: str) -> None:

@@ -144,7 +144,7 @@ def test_groups_of_one_class_are_drawn_class_by_class() -> None:
         ({"n_classes": 1}, "n_classes=1"),
         ({"n_train": 3}, "n_train=3: expected a whole number of at least 4"),
         ({"n_time": 12}, "n_time=12: expected a whole number of at least 13"),
-        ({"correlation": 1.0}, r"expected \[0, 1\)"),
+        ({"correlation": 1.0}, r"correlation=1.0: expected a number in \[0, 1\)"),
         ({"gain": (2.0, 1.0)}, "weakest, strongest"),
         ({"floor": -0.1}, "floor=-0.1"),
     ],

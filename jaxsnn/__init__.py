@@ -1,69 +1,63 @@
 """Spiking networks that learn to steer a robot by reward-modulated STDP, and the robot's world.
 
-Kernels: `neurons`, `plasticity`, `window`. Network: `encoding`, `rewards`, `config`,
-`running_mean`, `network`, `presets`. World: `geometry`, `world`, `scenarios`, `maps`, `planner`.
-All together: `agents`, `trials`, `qlearning`. Imported by name only, for what they bring along:
-`jaxsnn.ppo` and `jaxsnn.navigation` (flax, optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env`
-(brax).
+The names below are the public ones. Kernels: `neurons`, `plasticity`, `window`, `encoding`.
+Network: `config`, `presets`, `agents`. World: `maps`, `scenarios`, `planner`, and `world`, whose
+`reset`, `observe` and `step` move one robot. All together: `trials`, `experiment`, `qlearning`.
+Imported by name only, for what they bring along: `jaxsnn.ppo` and `jaxsnn.navigation` (flax,
+optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
 """
 
-from jaxsnn import (
-    agents,
-    config,
-    encoding,
-    geometry,
-    maps,
-    network,
-    neurons,
-    planner,
-    plasticity,
-    presets,
-    qlearning,
-    rewards,
-    running_mean,
-    scenarios,
-    trials,
-    window,
-    world,
-)
-from jaxsnn.maps import random_map
-from jaxsnn.network import network_config, network_params
-from jaxsnn.neurons import LIFParams, lif_step
-from jaxsnn.plasticity import STDPParams, apply_reward, stdp_step
-from jaxsnn.presets import network_setting
+from jaxsnn.agents import Agent, SNNParams, snn_agent, snn_params
+from jaxsnn.config import NetworkConfig, NetworkParams, Weights
+from jaxsnn.encoding import poisson_spikes
+from jaxsnn.experiment import Experiment, run_experiment
+from jaxsnn.maps import make_map, random_map, stack_maps
+from jaxsnn.neurons import LIFParams, LIFState, lif_init, lif_scan, lif_step
+from jaxsnn.planner import shortest_path
+from jaxsnn.plasticity import STDPParams, STDPState, apply_reward, stdp_init, stdp_step
+from jaxsnn.presets import preset
+from jaxsnn.qlearning import QParams
+from jaxsnn.rewards import RewardParams
 from jaxsnn.scenarios import scenario
-from jaxsnn.trials import run_experiment, run_trial
-from jaxsnn.window import stdp_window
+from jaxsnn.status import Status
+from jaxsnn.trials import TrialResult, run_phase, success_rate
+from jaxsnn.window import stdp_kernel, stdp_window
+from jaxsnn.world import WorldParams
 
 __all__ = [
+    "Agent",
+    "Experiment",
     "LIFParams",
+    "LIFState",
+    "NetworkConfig",
+    "NetworkParams",
+    "QParams",
+    "RewardParams",
+    "SNNParams",
     "STDPParams",
-    "agents",
+    "STDPState",
+    "Status",
+    "TrialResult",
+    "Weights",
+    "WorldParams",
     "apply_reward",
-    "config",
-    "encoding",
-    "geometry",
+    "lif_init",
+    "lif_scan",
     "lif_step",
-    "maps",
-    "network",
-    "network_config",
-    "network_params",
-    "network_setting",
-    "neurons",
-    "planner",
-    "plasticity",
-    "presets",
-    "qlearning",
+    "make_map",
+    "poisson_spikes",
+    "preset",
     "random_map",
-    "rewards",
     "run_experiment",
-    "run_trial",
-    "running_mean",
+    "run_phase",
     "scenario",
-    "scenarios",
+    "shortest_path",
+    "snn_agent",
+    "snn_params",
+    "stack_maps",
+    "stdp_init",
+    "stdp_kernel",
     "stdp_step",
     "stdp_window",
-    "trials",
-    "window",
-    "world",
+    "success_rate",
 ]

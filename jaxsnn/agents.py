@@ -17,7 +17,7 @@ from jaxsnn import network
 from jaxsnn.config import NetworkConfig, NetworkParams, check_network
 from jaxsnn.encoding import group_rates, poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
-from jaxsnn.rewards import motor_rewards, tempered, terminal_reward
+from jaxsnn.rewards import motor_rewards, scale_by_remaining_turn, terminal_reward
 from jaxsnn.window import STDPKernel
 from jaxsnn.world import Outcome, Reading
 
@@ -29,8 +29,8 @@ class Agent(NamedTuple):
 
     Attributes:
         init: `(key, P) -> S`, a naive agent.
-        act: `(P, S, reading, key, fresh, active) -> (S, steering, M, info)`. `fresh` is true in the
-            first step of a trial. With `active` false nothing may be learnt. Steering is in
+        act: `(P, S, reading, fresh, active, *, key) -> (S, steering, M, info)`. `fresh` is true in
+            the first step of a trial. With `active` false nothing may be learnt. Steering is in
             degrees, positive to the left; `info` is a vector that trials average.
         learn: `(P, S, M, outcome, next_reading, active) -> S`; the reading is None unless
             `needs_next`.
@@ -55,7 +55,7 @@ class SNNParams(NamedTuple):
 
 
 class SNNMemory(NamedTuple):
-    """Eligibility of the last held window and what was seen."""
+    """Eligibility of the last window and the reading that the network acted on."""
 
     eligibility: Eligibility | None
     reading: Reading
@@ -104,12 +104,12 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
     n_windows = config.control_steps // config.hold_steps
     table = config.rates
 
-    def earned(constants: NetworkParams, reading: Reading, held: Eligibility) -> Array:
-        turn = steering_angle(constants, held.output_count / held.duration)
+    def reward_of(constants: NetworkParams, reading: Reading, window: Eligibility) -> Array:
+        turn = steering_angle(constants, window.output_count / window.duration)
         reward = motor_rewards(
             constants.reward, reading.sonar, reading.distance, reading.angle, turn
         )
-        return tempered(constants.reward, reward, turn)
+        return scale_by_remaining_turn(constants.reward, reward, turn)
 
     def init(key: Key[Array, ""], params: SNNParams) -> NetworkState:
         return network.init(key, config, params.network)
@@ -118,18 +118,19 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         params: SNNParams,
         state: NetworkState,
         reading: Reading,
-        key: Key[Array, ""],
         fresh: Bool[Array, ""],
         active: Bool[Array, ""],
+        *,
+        key: Key[Array, ""],
     ) -> tuple[NetworkState, Float[Array, ""], SNNMemory, Float[Array, "3"]]:
         constants = params.network
         by_group = group_rates(table, reading.sonar, reading.distance, reading.angle)
         rates = jnp.repeat(by_group, config.group_exc + config.group_inh)
-        state = network.settle(constants, state, fresh)
+        state = network.reset_membranes(constants, state, fresh)
 
         def draw(index: Array | int) -> Array:
             window_key = jax.random.fold_in(key, index)
-            return poisson_spikes(window_key, rates, config.hold_steps, dt=config.dt)
+            return poisson_spikes(rates, config.hold_steps, dt=config.dt, key=window_key)
 
         def run(state: NetworkState, index: Array | int, keep: Any) -> tuple:
             pre = draw(index)
@@ -142,29 +143,30 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
             hidden = jnp.sum(spikes.hidden) / config.n_hidden
             return jnp.append(jnp.sum(spikes.output, axis=0), hidden)
 
-        keep = 1.0 - fresh.astype(jnp.float32)
-        going = active.astype(jnp.float32)
-        total = jnp.zeros((3,), jnp.float32)
+        dtype = state.hidden.v.dtype
+        keep = 1.0 - fresh.astype(dtype)
+        learning = active.astype(dtype)
+        total = jnp.zeros((3,), dtype)
         if n_windows > 1:
 
             def body(carry: tuple, index: Array) -> tuple:
                 state, total = carry
-                held_keep = jnp.where(index == 0, keep, 1.0)
-                state, held, spikes = run(state, index, held_keep)
+                window_keep = jnp.where(index == 0, keep, 1.0)
+                state, eligibility, spikes = run(state, index, window_keep)
                 if plastic:
                     weights = network.reinforce(
-                        config, constants, state.weights, held,
-                        earned(constants, reading, held), going,
+                        config, constants, state.weights, eligibility,
+                        reward_of(constants, reading, eligibility), learning,
                     )  # fmt: skip
                     state = state._replace(weights=weights)
                 return (state, total + count(spikes)), None
 
             (state, total), _ = jax.lax.scan(body, (state, total), jnp.arange(n_windows - 1))
             keep = jnp.ones_like(keep)
-        state, held, spikes = run(state, n_windows - 1, keep)
+        state, eligibility, spikes = run(state, n_windows - 1, keep)
         firing = (total + count(spikes)) / (config.control_steps * config.dt)
         steering = steering_angle(constants, firing[:2])
-        return state, steering, SNNMemory(held, reading), firing
+        return state, steering, SNNMemory(eligibility, reading), firing
 
     def learn(
         params: SNNParams,
@@ -177,15 +179,15 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         if not plastic or memory.eligibility is None:
             return state
         constants = params.network
-        seen = memory.reading
+        observed = memory.reading
         if config.reward_timing == "after" and next_reading is not None:
-            seen = next_reading
-        reward = earned(constants, seen, memory.eligibility)
+            observed = next_reading
+        reward = reward_of(constants, observed, memory.eligibility)
         end = terminal_reward(constants.reward, outcome.collided, outcome.arrived)
         reward = jnp.where(outcome.collided | outcome.arrived, end, reward)
-        going = active.astype(jnp.float32)
+        learning = active.astype(state.weights.hidden.dtype)
         weights = network.reinforce(
-            config, constants, state.weights, memory.eligibility, reward, going
+            config, constants, state.weights, memory.eligibility, reward, learning
         )
         return state._replace(weights=weights)
 

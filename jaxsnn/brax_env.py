@@ -34,8 +34,8 @@ class PipelineState(NamedTuple):
     take.
     """
 
-    robot: world.State  # its key replaced by words [2] uint32
-    params: world.Params
+    robot: world.WorldState  # its key replaced by words [2] uint32
+    params: world.WorldParams
 
 
 def _typed(key: Array) -> Array:
@@ -45,11 +45,11 @@ def _typed(key: Array) -> Array:
     return jax.random.wrap_key_data(key)
 
 
-def _pack(robot: world.State) -> world.State:
+def _pack(robot: world.WorldState) -> world.WorldState:
     return robot._replace(key=jax.random.key_data(robot.key))
 
 
-def _unpack(robot: world.State) -> world.State:
+def _unpack(robot: world.WorldState) -> world.WorldState:
     return robot._replace(key=jax.random.wrap_key_data(robot.key))
 
 
@@ -65,16 +65,16 @@ class NavigationEnv(Env):
         params: the map; it travels in `pipeline_state` and may be changed there.
     """
 
-    def __init__(self, params: world.Params) -> None:
+    def __init__(self, params: world.WorldParams) -> None:
         self.params = params
 
     def reset(self, rng: jax.Array) -> State:
         """A robot in a start circle; `rng` may be a raw or a typed key."""
-        robot = world.reset(_typed(rng), self.params)
+        robot, obs = navigation.start_robot(self.params, key=_typed(rng))
         zero = jnp.zeros((), jnp.float32)
         return State(
             pipeline_state=PipelineState(_pack(robot), self.params),
-            obs=navigation.observation(world.observe(robot, self.params), self.params),
+            obs=obs,
             reward=zero,
             done=zero,
             metrics={"arrived": zero, "collided": zero, "failed": zero},
@@ -83,18 +83,17 @@ class NavigationEnv(Env):
 
     def step(self, state: State, action: jax.Array) -> State:
         """One control step of 15 pixels."""
-        held: Any = state.pipeline_state
-        before, params = _unpack(held.robot), held.params
-        steering = navigation.STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
-        robot, outcome = world.step(before, steering, params)
+        carried: Any = state.pipeline_state
+        params = carried.params
+        made = navigation.drive_robot(params, _unpack(carried.robot), action)
         flags = {
-            name: jnp.asarray(getattr(outcome, name)).astype(jnp.float32)
+            name: jnp.asarray(getattr(made.outcome, name)).astype(jnp.float32)
             for name in ("arrived", "collided", "failed")
         }
         return state.replace(
-            pipeline_state=PipelineState(_pack(robot), params),
-            obs=navigation.observation(world.observe(robot, params), params),
-            reward=navigation.navigation_reward(before, robot, outcome, params),
+            pipeline_state=PipelineState(_pack(made.robot), params),
+            obs=made.obs,
+            reward=made.reward,
             done=flags["arrived"] + flags["collided"] + flags["failed"],
             metrics={**state.metrics, **flags},
         )

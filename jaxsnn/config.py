@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsnn._checks import require, require_finite, require_positive
+from jaxsnn._checks import (
+    concrete,
+    default_float,
+    require,
+    require_choice,
+    require_finite,
+    require_positive,
+    require_whole,
+)
 from jaxsnn.encoding import N_GROUPS, AngleCode, RateTable, rate_table
 from jaxsnn.neurons import LIFParams, check_lif
 from jaxsnn.plasticity import Bounds, Rule, STDPParams, check_stdp
@@ -68,20 +76,22 @@ class NetworkConfig:
         """Refuse sizes and choices that make no network."""
         for name in ("hidden_exc", "hidden_inh"):
             n = getattr(self, name)
-            require(n >= 0 and n % 2 == 0, f"{name} = {n}: expected an even number, two halves")
-        require(self.n_hidden > 0, "hidden_exc = hidden_inh = 0: the hidden layer needs neurons")
+            require_whole(name, n, 0, "give 0 for none")
+            require(n % 2 == 0, f"{name}={n}: expected an even number; it has two halves")
+        require(
+            self.n_hidden > 0, "hidden_exc=0, hidden_inh=0: expected a hidden neuron; raise one"
+        )
         for name in ("group_exc", "group_inh"):
             n = getattr(self, name)
-            require(n >= 0, f"{name} = {n}: expected a number >= 0")
-        require(self.n_in > 0, "group_exc = group_inh = 0: a group needs input neurons")
+            require_whole(name, n, 0, "give 0 for none")
+        require(self.n_in > 0, "group_exc=0, group_inh=0: expected an input neuron; raise one")
         require_positive("dt", self.dt, "give the step in seconds, 1e-3 for one millisecond")
         for name in ("control_steps", "hold_steps"):
-            n = getattr(self, name)
-            require(n > 0, f"{name} = {n}: expected at least one step")
+            require_whole(name, getattr(self, name), 1, "give at least one step")
         require(
             self.control_steps % self.hold_steps == 0,
-            f"hold_steps = {self.hold_steps} does not divide control_steps = {self.control_steps}; "
-            "choose a divisor",
+            f"hold_steps={self.hold_steps}: expected a divisor of control_steps = "
+            f"{self.control_steps}; choose one",
         )
         choices: dict[str, tuple[str, ...]] = {
             "rule": ("additive", "multiplicative"),
@@ -91,8 +101,7 @@ class NetworkConfig:
             "reward_timing": ("before", "after"),
         }
         for name, allowed in choices.items():
-            value = getattr(self, name)
-            require(value in allowed, f"{name} = {value!r}: expected one of {allowed}")
+            require_choice(name, getattr(self, name), allowed)
         rate_table(self.encoding, self.angle_code)
 
     @property
@@ -146,8 +155,8 @@ class NetworkParams(NamedTuple):
             what keeps one motor from winning for good.
         rate_hidden, rate_output: target rates of the scaling [Hz].
         centring: share of a presynaptic neuron's mean firing that is taken off before the trace is
-            formed; 0 is the source, 1 makes the trace a covariance (see `baseline`).
-        tau_usual: time constant of that mean [s].
+            formed; 0 is the source, 1 makes the trace a covariance (see `running_mean`).
+        tau_baseline: time constant of that mean [s].
     """
 
     hidden: LIFParams = LIFParams()
@@ -166,7 +175,7 @@ class NetworkParams(NamedTuple):
     homeostasis: float | Array = 0.0
     homeostasis_output: float | Array = 1.0
     centring: float | Array = 0.0
-    tau_usual: float | Array = 20.0
+    tau_baseline: float | Array = 20.0
     rate_hidden: float | Array = 25.0
     rate_output: float | Array = 60.0
 
@@ -185,8 +194,7 @@ def network_config(name: str, **changes: Any) -> NetworkConfig:
         >>> network_config("S2").n_hidden, network_config("S4").n_hidden
         (210, 208)
     """
-    if name not in NETWORKS:
-        raise ValueError(f"network = {name!r}: expected one of {sorted(NETWORKS)}")
+    require_choice("model", name, tuple(NETWORKS))
     return NetworkConfig(**{**NETWORKS[name], **changes})
 
 
@@ -205,7 +213,7 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
     check_lif(params.output, dt=config.dt)
     check_stdp(params.stdp, dt=config.dt)
     check_rewards(params.reward)
-    require_positive("tau_usual", params.tau_usual, "give it in seconds")
+    require_positive("tau_baseline", params.tau_baseline, "give it in seconds")
     positive = ("w_max", "w_max_low", "gain_input", "gain_output", "rate_hidden", "rate_output")
     for name in positive:
         require_positive(name, getattr(params, name), "give it in mV (rates: Hz)")
@@ -220,6 +228,20 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
     ):
         require_positive(name, getattr(params, name), "give a number >= 0", zero=True)
     require_finite("steering_gain", params.steering_gain, "give degrees per Hz")
+    low = concrete(params.w_min)
+    for name in ("w_max", "w_max_low"):
+        high = concrete(getattr(params, name))
+        if low is not None and high is not None:
+            require(
+                bool((low <= high).all()),
+                f"w_min={low.max():g}: expected at most {name} = {high.min():g}; lower it",
+            )
+    init = concrete(params.init_low)
+    if init is not None:
+        require(
+            bool((init <= 1.0).all()),
+            f"init_low={init.max():g}: expected a fraction of the bound, at most 1; lower it",
+        )
 
 
 def neuron_signs(config: NetworkConfig) -> tuple[np.ndarray, np.ndarray]:
@@ -232,7 +254,8 @@ def neuron_signs(config: NetworkConfig) -> tuple[np.ndarray, np.ndarray]:
 def weight_bounds(config: NetworkConfig, params: NetworkParams) -> Weights:
     """Upper bounds [mV]: `[n_in or 1, n_hidden or 1]` and `[1, 1]`, to broadcast with `Weights`."""
     pre, hidden = neuron_signs(config)
-    high, low = jnp.asarray(params.w_max, jnp.float32), jnp.asarray(params.w_max_low, jnp.float32)
+    dtype = default_float()
+    high, low = jnp.asarray(params.w_max, dtype), jnp.asarray(params.w_max_low, dtype)
     if config.encoding == "reference":
         first = high[None, None]
     elif config.w_max_split == "post":

@@ -10,15 +10,22 @@ from typing import Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Key
 
-from jaxsnn._checks import concrete, require, require_positive
+from jaxsnn._checks import (
+    concrete,
+    require,
+    require_choice,
+    require_key,
+    require_positive,
+    require_whole,
+)
+from jaxsnn.sensor_intervals import angle_region, distance_interval, sonar_interval
 
 __all__ = [
     "ANGLE_CODES",
     "N_GROUPS",
     "RateTable",
-    "angle_region",
     "check_rates",
     "group_rates",
     "poisson_spikes",
@@ -70,10 +77,8 @@ def rate_table(
         >>> rate_table("proposed").sonar.tolist()
         [0.0, 50.0, 100.0]
     """
-    if scheme not in ("reference", "proposed"):
-        raise ValueError(f"scheme = {scheme!r}: expected 'reference' or 'proposed'")
-    if angle_code not in ANGLE_CODES:
-        raise ValueError(f"angle_code = {angle_code!r}: expected one of {sorted(ANGLE_CODES)}")
+    require_choice("scheme", scheme, ("reference", "proposed"))
+    require_choice("angle_code", angle_code, tuple(ANGLE_CODES))
     reference = scheme == "reference"
     sonar = jnp.array([0.0, 20.0, 40.0] if reference else [0.0, 50.0, 100.0])
     distance = jnp.array([10.0, 20.0, 30.0, 40.0] if reference else [25.0, 50.0, 75.0, 100.0])
@@ -89,31 +94,14 @@ def check_rates(rates: RateTable | Float[Array, "..."], *, dt: float) -> None:
         ValueError: names the rate and the fix.
     """
     for leaf in jax.tree.leaves(rates):
-        require_positive("firing rate", leaf, "give rates in Hz", zero=True)
+        require_positive("rates", leaf, "give firing rates in Hz", zero=True)
         numbers = concrete(leaf)
         if numbers is not None:
             require(
                 bool(numbers.max() * dt <= 1.0),
-                f"firing rate = {numbers.max()} Hz is above one spike per step of {dt} s; "
-                "lower it or dt",
+                f"rates={numbers.max()}: expected at most one spike per step, {1 / dt:g} Hz with "
+                f"dt={dt}; lower the rate or dt",
             )
-
-
-def angle_region(angle: Float[Array, "*n"]) -> Int[Array, "*n"]:
-    """Region of Figure 2.4 that holds the target: 0 ahead, 1 right, 2 behind, 3 left.
-
-    Quarter circles centred on the heading; regions 1 to 4 of the source, clockwise, less one.
-
-    Args:
-        angle: from the heading to the target [deg], positive to the left, in (-180, 180].
-
-    Example:
-        >>> angle_region(jnp.array([0.0, -90.0, 180.0, 90.0])).tolist()
-        [0, 1, 2, 3]
-    """
-    region = jnp.where(angle > 0, 3, 1)
-    region = jnp.where(jnp.abs(angle) <= 45.0, 0, region)
-    return jnp.where(jnp.abs(angle) > 135.0, 2, region)
 
 
 def group_rates(
@@ -133,19 +121,19 @@ def group_rates(
     Returns:
         Rates [Hz]: five sonars, distance, angle.
 
-    Source:
-        Shim (2020), section 2.4.2. A reading between the printed integer bounds (99 to 100) belongs
-        to the lower interval.
+    Source: Shim (2020), section 2.4.2; `sensor_intervals` says what belongs to which interval.
     """
-    near = jnp.clip(jnp.floor(sonar / 100.0), 0, 2).astype(jnp.int32)
-    far = jnp.clip(jnp.floor(distance / 200.0), 0, 3).astype(jnp.int32)
     return jnp.concatenate(
-        [table.sonar[near], table.distance[far][None], table.angle[angle_region(angle)][None]]
+        [
+            table.sonar[sonar_interval(sonar)],
+            table.distance[distance_interval(distance)][None],
+            table.angle[angle_region(angle)][None],
+        ]
     )
 
 
 def poisson_spikes(
-    key: Key[Array, ""], rates: Float[Array, " n"], n_steps: int, *, dt: float
+    rates: Float[Array, " n"], n_steps: int, *, dt: float, key: Key[Array, ""]
 ) -> Float[Array, "t n"]:
     r"""Independent Poisson (Bernoulli per step) spike trains, 0. or 1.
 
@@ -155,21 +143,28 @@ def poisson_spikes(
     (0.015 Hz at 1 ms): half the random numbers, and random numbers are a tenth of a window's work.
 
     Args:
-        key: typed PRNG key; its implementation (threefry, rbg) is the caller's choice.
         rates: per neuron [Hz].
         n_steps: number of steps.
         dt: step [s].
+        key: typed PRNG key; its implementation (threefry, rbg) is the caller's choice.
 
     Returns:
-        Spikes, `[n_steps, n]` float32.
+        Spikes, `[n_steps, n]`, of the dtype of `rates`.
+
+    Raises:
+        ValueError: a rate is NaN, negative or above one spike per step; a legacy key.
 
     Example:
-        >>> poisson_spikes(jax.random.key(0), jnp.array([0.0, 1000.0]), 4, dt=1e-3).sum(0).tolist()
+        >>> rates, key = jnp.array([0.0, 1000.0]), jax.random.key(0)
+        >>> poisson_spikes(rates, 4, dt=1e-3, key=key).sum(0).tolist()
         [0.0, 4.0]
     """
+    require_key(key)
+    require_whole("n_steps", n_steps, 1, "ask for at least one step")
+    check_rates(rates, dt=dt)
     n = rates.shape[0]
     words = jax.random.bits(key, (n_steps, (n + 1) // 2), jnp.uint32)
     low, high = words & jnp.uint32(0xFFFF), words >> jnp.uint32(16)
     draws = jnp.concatenate([low, high], axis=1)[:, :n]
     threshold = jnp.round(rates * (dt * 65536.0)).astype(jnp.uint32)
-    return (draws < threshold[None, :]).astype(jnp.float32)
+    return (draws < threshold[None, :]).astype(rates.dtype)

@@ -237,27 +237,32 @@ def check_polygon(polygon: Polygon, name: str) -> np.ndarray:
     points = np.asarray(polygon, dtype=np.float64)
     if points.ndim != 2 or points.shape[1] != 2 or len(points) < 3:
         raise ValueError(
-            f"{name} has shape {points.shape}; a polygon needs at least three corners (x, y), "
+            f"{name}=<shape {points.shape}>: expected at least three corners (x, y), "
             "without repeating the first one at the end"
         )
     if not np.isfinite(points).all():
-        raise ValueError(f"{name} has a corner that is not finite: {points.tolist()}")
+        raise ValueError(f"{name}={points.tolist()}: expected finite corners; one is not finite")
     sides = polygon_segments(points)
     lengths = np.hypot(sides[:, 2] - sides[:, 0], sides[:, 3] - sides[:, 1])
     if lengths.min() < 1e-3:
         corner = points[int(lengths.argmin())].tolist()
-        raise ValueError(f"{name} repeats its corner {corner}; leave the second one out")
+        raise ValueError(
+            f"{name}={points.tolist()}: expected each corner once, it repeats its corner {corner}; "
+            "leave the second one out"
+        )
     x, y = points.T
     area = 0.5 * abs(float(np.sum(x * np.roll(y, -1) - y * np.roll(x, -1))))
     if area < 1e-6 * lengths.max() ** 2:
-        raise ValueError(f"{name} has area {area:.3g}: its corners lie on a line; move one of them")
+        raise ValueError(
+            f"{name}={points.tolist()}: expected an area, it has area {area:.3g}; move a corner"
+        )
     n = len(points)
     gaps = segment_distance(sides[:, :2], sides[:, 2:], sides)
     for i in range(n):
         for j in range(i + 2, n):
             if (i, j) != (0, n - 1) and gaps[i, j] < 1e-9:
                 raise ValueError(
-                    f"{name} crosses itself: side {i} meets side {j}; list the corners in order "
-                    "around the obstacle"
+                    f"{name}={points.tolist()}: expected a simple polygon, it crosses itself (side "
+                    f"{i} meets side {j}); list the corners in order around the obstacle"
                 )
     return points

@@ -1,6 +1,6 @@
 """Make maps on the host: checked obstacles, and random maps that a robot can solve.
 
-`make_map` turns polygons and circles into `jaxsnn.world.Params` and refuses a map that
+`make_map` turns polygons and circles into `jaxsnn.world.WorldParams` and refuses a map that
 no robot could run on, before anything is compiled. `random_map` draws maps until the planner
 can solve one.
 """
@@ -17,8 +17,9 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from jaxsnn import geometry
+from jaxsnn._checks import require_key
 from jaxsnn.planner import Obstacles, path_field
-from jaxsnn.world import N_SONARS, Params
+from jaxsnn.world import N_SONARS, WorldParams
 
 __all__ = ["make_map", "random_map", "stack_maps"]
 
@@ -30,7 +31,7 @@ Polygon = Sequence[Point] | np.ndarray
 def _positive(name: str, value: Number, *, zero: bool = False) -> float:
     if not math.isfinite(value) or value < 0 or (value == 0 and not zero):
         kind = "a finite number >= 0" if zero else "a finite number > 0"
-        raise ValueError(f"{name} = {value} must be {kind}")
+        raise ValueError(f"{name}={value}: expected {kind}; check its unit")
     return float(value)
 
 
@@ -40,13 +41,13 @@ def _rows(name: str, values: Any, width: int) -> np.ndarray:
         np.asarray(values, np.float64).reshape(-1, width) if len(values) else np.zeros((0, width))
     )
     if not np.isfinite(rows).all():
-        raise ValueError(f"{name} holds a value that is not finite: {rows.tolist()}")
+        raise ValueError(f"{name}={rows.tolist()}: expected finite numbers; one is not finite")
     return rows
 
 
 def _pad(name: str, rows: np.ndarray, size: int, fill: float = 0.0) -> np.ndarray:
     if len(rows) > size:
-        raise ValueError(f"{name}: {len(rows)} of them, but max_{name} = {size}; raise it")
+        raise ValueError(f"{name}=<{len(rows)}>: expected at most max_{name} = {size}; raise it")
     padding = np.full((size - len(rows), *rows.shape[1:]), fill)
     return np.concatenate([rows, padding])
 
@@ -76,7 +77,7 @@ def make_map(
     max_segments: int = 40,
     max_circles: int = 8,
     max_starts: int = 2,
-) -> Params:
+) -> WorldParams:
     """A checked map, padded so that maps of different obstacles share one compiled program.
 
     Args:
@@ -105,7 +106,7 @@ def make_map(
         max_starts: room for start circles.
 
     Returns:
-        Params, float32.
+        WorldParams, float32.
 
     Raises:
         ValueError: a degenerate polygon, an obstacle outside the walls, a start circle in which the
@@ -114,17 +115,23 @@ def make_map(
     """
     walls = _rows("bounds", bounds, 4)
     if len(walls) != 1 or walls[0, 0] >= walls[0, 2] or walls[0, 1] >= walls[0, 3]:
-        raise ValueError(f"bounds {list(bounds)} must be (x0, y0, x1, y1) with x0 < x1 and y0 < y1")
+        raise ValueError(
+            f"bounds={list(bounds)}: expected (x0, y0, x1, y1) with x0 < x1, y0 < y1; reorder"
+        )
     x0, y0, x1, y1 = walls[0]
     shapes = [geometry.check_polygon(p, f"polygon {i}") for i, p in enumerate(polygons)]
     rounds = _rows("circles", circles, 3)
     for i, shape in enumerate(shapes):
         if (shape < [x0, y0]).any() or (shape > [x1, y1]).any():
-            raise ValueError(f"polygon {i} leaves the walls {walls[0].tolist()}; clip it to them")
+            raise ValueError(
+                f"polygon {i}={shape.tolist()}: expected inside {walls[0].tolist()}; clip it"
+            )
     for i, (cx, cy, r) in enumerate(rounds):
         _positive(f"radius of circle {i}", r)
         if not (x0 <= cx <= x1 and y0 <= cy <= y1):
-            raise ValueError(f"circle {i} has its centre ({cx:g}, {cy:g}) outside the walls")
+            raise ValueError(
+                f"circle {i}=({cx:g}, {cy:g}, {r:g}): expected its centre inside the walls; move it"
+            )
     for name, value in (
         ("arrival_radius", arrival_radius),
         ("speed", speed),
@@ -141,32 +148,38 @@ def make_map(
     ):
         _positive(name, value, zero=True)
     if patrol_steps != int(patrol_steps) or patrol_steps < 1:
-        raise ValueError(f"patrol_steps = {patrol_steps} must be a whole number of steps >= 1")
+        raise ValueError(
+            f"patrol_steps={patrol_steps}: expected a whole number of steps >= 1; round it"
+        )
     if len(sonar_angles) != N_SONARS or not np.isfinite(sonar_angles).all():
-        raise ValueError(f"sonar_angles {list(sonar_angles)} must be {N_SONARS} finite angles")
+        raise ValueError(
+            f"sonar_angles={list(sonar_angles)}: expected {N_SONARS} finite angles; one per sonar"
+        )
     goal = _rows("target", target, 2)
     begin = _rows("starts", starts, 3)
     if not len(begin) or (begin[:, 2] < 0).any():
-        raise ValueError(f"starts {begin.tolist()} must be at least one (x, y, radius >= 0)")
+        raise ValueError(
+            f"starts={begin.tolist()}: expected at least one (x, y, radius >= 0); add one"
+        )
     probs = np.full(len(begin), 1.0) if start_probs is None else np.asarray(start_probs, np.float64)
     if probs.shape != (len(begin),) or not (probs >= 0).all() or not probs.sum() > 0:
         raise ValueError(
-            f"start_probs {probs.tolist()} must be one number >= 0 for each of the {len(begin)} "
-            "start circles, not all zero"
+            f"start_probs={probs.tolist()}: expected one number >= 0 for each of the {len(begin)} "
+            "start circles, not all zero; leave them out for equal shares"
         )
     failed, stuck = np.zeros(N_SONARS, bool), np.zeros(N_SONARS)
     for index, value in (sonar_stuck or {}).items():
         if not 0 <= index < N_SONARS or not 0.0 <= value <= sonar_range:
             raise ValueError(
-                f"sonar_stuck {{{index}: {value}}} must name a sonar 0..{N_SONARS - 1} and a value "
-                f"in [0, {sonar_range:g}]"
+                f"sonar_stuck={{{index}: {value}}}: expected a sonar 0..{N_SONARS - 1} and a value "
+                f"in [0, {sonar_range:g}]; change it"
             )
         failed[index], stuck[index] = True, value
 
     def velocities(name: str, given: Sequence[Point] | None, n: int) -> np.ndarray:
         rows = np.zeros((n, 2)) if given is None else _rows(name, given, 2)
         if len(rows) != n:
-            raise ValueError(f"{name} has {len(rows)} rows for {n} obstacles; give one for each")
+            raise ValueError(f"{name}=<{len(rows)} rows>: expected {n}; give one for each obstacle")
         return rows
 
     drift = velocities("polygon_velocity", polygon_velocity, len(shapes))
@@ -179,7 +192,7 @@ def make_map(
     def floats(values: Any) -> Array:
         return jnp.asarray(np.asarray(values), jnp.float32)
 
-    params = Params(
+    params = WorldParams(
         segments=floats(_pad("segments", segments, max_segments)),
         segment_mask=jnp.arange(max_segments) < len(segments),
         circles=floats(_pad("circles", rounds, max_circles)),
@@ -209,7 +222,7 @@ def make_map(
 
 
 def _check_starts(
-    params: Params,
+    params: WorldParams,
     segments: np.ndarray,
     circles: np.ndarray,
     starts: np.ndarray,
@@ -222,7 +235,7 @@ def _check_starts(
     room = float(everything.clearance(target[None], target[None])[0])
     if room <= 0:
         raise ValueError(
-            f"target {target.tolist()} lies inside an obstacle or wall and is unreachable; move it"
+            f"target={target.tolist()}: expected outside of obstacles, it is unreachable; move it"
         )
     field = path_field(params)
     for i, ((x, y, r), p) in enumerate(zip(starts, probs, strict=True)):
@@ -230,34 +243,33 @@ def _check_starts(
         room = float(everything.clearance(centre, centre)[0])
         if room < r + radius:
             raise ValueError(
-                f"start circle {i} at ({x:g}, {y:g}) of radius {r:g} lets the robot (radius "
-                f"{radius:g}) start inside an obstacle or wall: {room:.1f} px are free around its "
-                f"centre, {r + radius:g} are needed; move or shrink it"
+                f"start circle {i}=({x:g}, {y:g}, {r:g}): expected {r + radius:g} px free around "
+                f"its centre for a robot of radius {radius:g}, {room:.1f} px are; move or shrink it"
             )
         gap = float(np.hypot(*(centre[0] - target)))
         if gap - r <= float(params.arrival_radius):
             raise ValueError(
-                f"start circle {i} at ({x:g}, {y:g}) reaches into the target's arrival circle; "
-                "move one of them or make arrival_radius smaller"
+                f"start circle {i}=({x:g}, {y:g}, {r:g}): expected outside the target's arrival "
+                "circle; move one of them or make arrival_radius smaller"
             )
         if p > 0 and not math.isfinite(field.lengths(centre)[0]):
             raise ValueError(
-                f"target {target.tolist()} is unreachable from start circle {i} at ({x:g}, {y:g}) "
-                f"for a robot of radius {radius:g}; open a gap between the obstacles"
+                f"target={target.tolist()}: expected a way to it, it is unreachable from start "
+                f"circle {i} at ({x:g}, {y:g}) for a robot of radius {radius:g}; open a gap"
             )
 
 
-def stack_maps(maps: Sequence[Params]) -> Params:
-    """Maps of equal padding as one Params with a leading axis, ready for `jax.vmap`."""
+def stack_maps(maps: Sequence[WorldParams]) -> WorldParams:
+    """Maps of equal padding as one WorldParams with a leading axis, ready for `jax.vmap`."""
     if not maps:
-        raise ValueError("stack_maps needs at least one map, got none")
+        raise ValueError("maps=[]: expected at least one map; give one")
     # On the host: stacking on the device would compile once for each shape.
     return jax.tree.map(lambda *leaves: jnp.asarray(np.stack(leaves)), *maps)
 
 
 def random_map(
-    key: Key[Array, ""],
     *,
+    key: Key[Array, ""],
     n_obstacles: tuple[int, int] = (4, 8),
     obstacle_radius: tuple[Number, Number] = (25.0, 55.0),
     size: tuple[Number, Number] = (800.0, 600.0),
@@ -266,7 +278,7 @@ def random_map(
     clearance: Number = 20.0,
     attempts: int = 1000,
     **constants: Any,
-) -> Params:
+) -> WorldParams:
     """A random map that a robot can solve: triangles to hexagons and circles, one start, one
     target.
 
@@ -282,23 +294,26 @@ def random_map(
         **constants: passed on to `make_map`.
 
     Returns:
-        Params with the padding of `make_map`.
+        WorldParams with the padding of `make_map`.
 
     Raises:
         ValueError: no solvable map within `attempts`, or the ranges are impossible.
     """
+    require_key(key)
     if not 0 <= n_obstacles[0] <= n_obstacles[1]:
         raise ValueError(
-            f"n_obstacles = {n_obstacles} must be (fewest, most) with 0 <= fewest <= most"
+            f"n_obstacles={n_obstacles}: expected (fewest, most) with 0 <= fewest <= most; reorder"
         )
     if not 0 < obstacle_radius[0] <= obstacle_radius[1]:
-        raise ValueError(f"obstacle_radius = {obstacle_radius} must be (smallest, largest), > 0")
+        raise ValueError(
+            f"obstacle_radius={obstacle_radius}: expected (smallest, largest), > 0; reorder them"
+        )
     rng = np.random.default_rng(np.asarray(jax.random.key_data(key)).ravel().tolist())
     arrival = float(constants.get("arrival_radius", 35.0))
     margin = 2.0 * clearance + start_radius
     if min(size) <= 2.0 * margin:
         raise ValueError(
-            f"size = {size} leaves no room for a start circle {margin:g} px from walls"
+            f"size={size}: expected room for a start circle {margin:g} px from the walls; raise it"
         )
     low, high = np.full(2, margin), np.asarray(size) - margin
     for _ in range(attempts):
@@ -343,6 +358,6 @@ def random_map(
         if math.isfinite(path_field(params, clearance=clearance).lengths(start[None])[0]):
             return params
     raise ValueError(
-        f"no solvable map in {attempts} attempts with n_obstacles = {n_obstacles} and "
+        f"attempts={attempts}: expected a solvable map among them with {n_obstacles=}, "
         f"min_distance = {min_distance}; ask for fewer or smaller obstacles"
     )

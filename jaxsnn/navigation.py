@@ -1,21 +1,28 @@
-"""The robot world as an environment for reinforcement learning: observation, action, reward."""
+"""The robot world as an environment for reinforcement learning: observation, action, reward.
+
+`start_robot` and `drive_robot` are one robot's episode; `navigation_env` and `brax_env` wrap them.
+"""
 
 from __future__ import annotations
 
 from typing import NamedTuple
 
 import jax.numpy as jnp
-from jaxtyping import Array, Float
+from jaxtyping import Array, Float, Key
 
 from jaxsnn import world
+from jaxsnn._checks import require_whole
 from jaxsnn.ppo import Env, Transition
 
 __all__ = [
     "OBSERVATION_SIZE",
     "STEERING_SCALE",
+    "Drive",
+    "drive_robot",
     "navigation_env",
     "navigation_reward",
     "observation",
+    "start_robot",
 ]
 
 OBSERVATION_SIZE = world.N_SONARS + 3
@@ -23,13 +30,22 @@ OBSERVATION_SIZE = world.N_SONARS + 3
 STEERING_SCALE = 45.0
 
 
+class Drive(NamedTuple):
+    """What one control step of a robot gives a learner."""
+
+    robot: world.WorldState
+    obs: Float[Array, "8"]
+    reward: Float[Array, ""]
+    outcome: world.Outcome
+
+
 class _Navigation(NamedTuple):
-    robot: world.State
+    robot: world.WorldState
     length: Array  # path so far [px]
     start: Array  # [2]
 
 
-def observation(reading: world.Reading, params: world.Params) -> Float[Array, "8"]:
+def observation(params: world.WorldParams, reading: world.Reading) -> Float[Array, "8"]:
     """Readings in [-1, 1]: five sonars, the distance, and sine and cosine of the angle."""
     angle = jnp.deg2rad(reading.angle)
     rest = [reading.distance / params.distance_range, jnp.sin(angle), jnp.cos(angle)]
@@ -37,7 +53,10 @@ def observation(reading: world.Reading, params: world.Params) -> Float[Array, "8
 
 
 def navigation_reward(
-    before: world.State, after: world.State, outcome: world.Outcome, params: world.Params
+    params: world.WorldParams,
+    before: world.WorldState,
+    after: world.WorldState,
+    outcome: world.Outcome,
 ) -> Float[Array, ""]:
     r"""Arrival +2, collision -2, and one for each 100 px that the target comes nearer.
 
@@ -46,7 +65,7 @@ def navigation_reward(
     The last term sums to the distance covered towards the target and so favours no detour.
     """
 
-    def distance(state: world.State) -> Array:
+    def distance(state: world.WorldState) -> Array:
         return jnp.hypot(params.target[0] - state.x, params.target[1] - state.y)
 
     ends = jnp.where(outcome.arrived, 2.0, 0.0) - jnp.where(outcome.collided, 2.0, 0.0)
@@ -54,7 +73,29 @@ def navigation_reward(
     return ends.astype(progress.dtype) + progress
 
 
-def navigation_env(params: world.Params, *, max_steps: int = 200) -> Env:
+def start_robot(
+    params: world.WorldParams, *, key: Key[Array, ""]
+) -> tuple[world.WorldState, Float[Array, "8"]]:
+    """A robot in a start circle, and its first observation."""
+    robot = world.reset(params, key=key)
+    return robot, observation(params, world.observe(params, robot))
+
+
+def drive_robot(
+    params: world.WorldParams, robot: world.WorldState, action: Float[Array, "1"]
+) -> Drive:
+    """One control step of 15 pixels; an action of 1 (and beyond) steers 45 degrees to the left."""
+    steering = STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
+    after, outcome = world.step(params, robot, steering)
+    return Drive(
+        robot=after,
+        obs=observation(params, world.observe(params, after)),
+        reward=navigation_reward(params, robot, after, outcome),
+        outcome=outcome,
+    )
+
+
+def navigation_env(params: world.WorldParams, *, max_steps: int = 200) -> Env:
     """The robot world as an `Env`; an action of 1 steers 45 degrees to the left.
 
     Args:
@@ -64,27 +105,24 @@ def navigation_env(params: world.Params, *, max_steps: int = 200) -> Env:
     Raises:
         ValueError: `max_steps` is below 1.
     """
-    if max_steps < 1:
-        raise ValueError(f"max_steps = {max_steps} must be at least 1")
+    require_whole("max_steps", max_steps, 1, "allow at least one control step")
 
     def reset(key: Array) -> tuple[_Navigation, Array]:
-        robot = world.reset(key, params)
-        obs = observation(world.observe(robot, params), params)
+        robot, obs = start_robot(params, key=key)
         start = jnp.stack([robot.x, robot.y])
         return _Navigation(robot, jnp.zeros_like(robot.x), start), obs
 
     def step(state: _Navigation, action: Array) -> Transition:
-        steering = STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
-        robot, outcome = world.step(state.robot, steering, params)
-        terminated = outcome.arrived | outcome.collided
-        moved = jnp.hypot(robot.x - state.robot.x, robot.y - state.robot.y)
+        made = drive_robot(params, state.robot, action)
+        terminated = made.outcome.arrived | made.outcome.collided
+        moved = jnp.hypot(made.robot.x - state.robot.x, made.robot.y - state.robot.y)
         return Transition(
-            state=state._replace(robot=robot, length=state.length + moved),
-            obs=observation(world.observe(robot, params), params),
-            reward=navigation_reward(state.robot, robot, outcome, params),
+            state=state._replace(robot=made.robot, length=state.length + moved),
+            obs=made.obs,
+            reward=made.reward,
             terminated=terminated,
-            truncated=(robot.t >= max_steps) & ~terminated,
-            success=outcome.arrived,
+            truncated=(made.robot.t >= max_steps) & ~terminated,
+            success=made.outcome.arrived,
         )
 
     return Env(reset, step, action_size=1)

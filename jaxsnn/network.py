@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxsnn._checks import require
+from jaxsnn._checks import require, require_key
 from jaxsnn.config import (
     NetworkConfig,
     NetworkParams,
@@ -38,13 +38,14 @@ __all__ = [
     "NetworkState",
     "Spikes",
     "Weights",
+    "check_weights",
     "fire",
     "init",
     "kernel",
     "network_config",
     "network_params",
     "reinforce",
-    "settle",
+    "reset_membranes",
     "step",
     "window",
 ]
@@ -53,7 +54,7 @@ __all__ = [
 class NetworkState(NamedTuple):
     """Weights, membranes of both layers, traces and eligibility of both sets of synapses.
 
-    The baselines are what input and hidden neurons usually fire; see `baseline`.
+    The baselines are running means of what input and hidden neurons fire; see `running_mean`.
     """
 
     weights: Weights
@@ -61,8 +62,8 @@ class NetworkState(NamedTuple):
     output: LIFState
     stdp_hidden: STDPState
     stdp_output: STDPState
-    usual_input: Baseline
-    usual_hidden: Baseline
+    baseline_input: Baseline
+    baseline_hidden: Baseline
 
 
 class Eligibility(NamedTuple):
@@ -105,6 +106,7 @@ def init(
     Raises:
         ValueError: a constant or a given weight is not acceptable.
     """
+    require_key(key)
     check_network(config, params)
     top = weight_bounds(config, params)
     shapes = (config.n_in, config.n_hidden), (2, config.n_half)
@@ -115,13 +117,8 @@ def init(
             u = jax.random.uniform(k, shape)
             drawn.append((params.init_low + (1.0 - params.init_low) * u) * bound)
         weights = Weights(*drawn)
-    for field, shape in zip(Weights._fields, shapes, strict=True):
-        given = getattr(weights, field)
-        require(
-            given.shape == shape,
-            f"weights.{field} has shape {given.shape}, this network needs {shape}",
-        )
-        check_bounds(given, params.w_min, getattr(top, field), f"weights.{field}")
+    else:
+        check_weights(config, params, weights)
     return NetworkState(
         weights=weights,
         hidden=lif_init(params.hidden, config.n_hidden),
@@ -130,32 +127,62 @@ def init(
         stdp_output=jax.tree.map(
             lambda x: jnp.broadcast_to(x, (2, *x.shape)), stdp_init(config.n_half, 1)
         ),
-        usual_input=baseline_init(config.n_in),
-        usual_hidden=baseline_init(config.n_hidden),
+        baseline_input=baseline_init(config.n_in),
+        baseline_hidden=baseline_init(config.n_hidden),
     )
+
+
+def check_weights(
+    config: NetworkConfig, params: NetworkParams, weights: Weights, robots: int | None = None
+) -> None:
+    """Refuse weights that this network cannot begin with.
+
+    Args:
+        config: NetworkConfig.
+        params: NetworkParams; bounds that are traced or differ between robots are not compared.
+        weights: of one network, or with a leading axis of `robots`.
+
+    Raises:
+        ValueError: a shape does not fit, or a weight is not finite or outside the bounds.
+    """
+    lead = () if robots is None else (robots,)
+    shapes = (*lead, config.n_in, config.n_hidden), (*lead, 2, config.n_half)
+    for field, shape in zip(Weights._fields, shapes, strict=True):
+        given = getattr(weights, field)
+        require(
+            given.shape == shape,
+            f"weights.{field}=<shape {given.shape}>: expected {shape}; use the config that they "
+            "were made with",
+        )
+    if any(jnp.ndim(getattr(params, name)) for name in ("w_min", "w_max", "w_max_low")):
+        return
+    for field, top in zip(Weights._fields, weight_bounds(config, params), strict=True):
+        check_bounds(getattr(weights, field), params.w_min, top, f"weights.{field}")
 
 
 def _centred(params: NetworkParams, state: NetworkState, pre: Array, hidden: Array) -> tuple:
-    """Spikes `[..., n]` of both presynaptic sides, less what these neurons usually fire."""
+    """Spikes `[..., n]` of both presynaptic sides, less their running means."""
 
-    def less(spikes: Array, usual: Baseline) -> Array:
-        return spikes - jnp.broadcast_to(params.centring * usual.mean, spikes.shape)
+    def less(spikes: Array, baseline: Baseline) -> Array:
+        return spikes - jnp.broadcast_to(params.centring * baseline.mean, spikes.shape)
 
-    return less(pre, state.usual_input), less(hidden, state.usual_hidden)
+    return less(pre, state.baseline_input), less(hidden, state.baseline_hidden)
 
 
-def _used_to(
+def _update_baselines(
     params: NetworkParams, state: NetworkState, pre: Array, hidden: Array, duration: float
 ) -> tuple[Baseline, Baseline]:
     """Both baselines after `duration` with these mean spikes per step."""
-    tau = params.tau_usual
+    tau = params.tau_baseline
     return (
-        baseline_update(state.usual_input, pre, tau=tau, duration=duration),
-        baseline_update(state.usual_hidden, hidden, tau=tau, duration=duration),
+        baseline_update(state.baseline_input, pre, tau=tau, duration=duration),
+        baseline_update(state.baseline_hidden, hidden, tau=tau, duration=duration),
     )
 
 
-def settle(params: NetworkParams, state: NetworkState, fresh: Bool[Array, ""]) -> NetworkState:
+def reset_membranes(
+    params: NetworkParams, state: NetworkState, fresh: Bool[Array, ""]
+) -> NetworkState:
     """Membranes at rest where `fresh` (a trial begins); traces are dropped by `window(keep=0)`."""
 
     def rest(lif: LIFParams, layer: LIFState) -> LIFState:
@@ -179,10 +206,10 @@ def _fire(
 ) -> tuple[LIFState, LIFState, Spikes]:
     """One step of both layers of neurons, given what the inputs add to the hidden layer."""
     hidden, fired = lif_step(params.hidden, hidden, 0.0, jump, dt=config.dt)
-    spikes = fired.astype(jnp.float32)
+    spikes = fired.astype(hidden.v.dtype)
     to_motor = jnp.sum(signed_output * spikes.reshape(2, config.n_half), axis=1)
     output, motor = lif_step(params.output, output, 0.0, to_motor, dt=config.dt)
-    return hidden, output, Spikes(hidden=spikes, output=motor.astype(jnp.float32))
+    return hidden, output, Spikes(hidden=spikes, output=motor.astype(output.v.dtype))
 
 
 def step(
@@ -219,16 +246,16 @@ def step(
     stdp_output = jax.vmap(lambda s, x, y: stdp_step(params.stdp, s, x, y, dt=config.dt))(
         state.stdp_output, second.reshape(2, -1), spikes.output[:, None]
     )
-    usual = _used_to(params, state, pre, spikes.hidden, config.dt)
-    held = Eligibility(
+    baselines = _update_baselines(params, state, pre, spikes.hidden, config.dt)
+    eligibility = Eligibility(
         hidden=stdp_hidden.z * config.dt,
         output=stdp_output.z[..., 0] * config.dt,
         hidden_count=spikes.hidden,
         output_count=spikes.output,
         duration=config.dt,
     )
-    weights = reinforce(config, params, weights, held, reward)
-    return NetworkState(weights, hidden, output, stdp_hidden, stdp_output, *usual), spikes
+    weights = reinforce(config, params, weights, eligibility, reward)
+    return NetworkState(weights, hidden, output, stdp_hidden, stdp_output, *baselines), spikes
 
 
 def _signed_output(config: NetworkConfig, params: NetworkParams, weights: Weights) -> Array:
@@ -283,28 +310,29 @@ def window(
         all spikes.
     """
     state, spikes = fire(config, params, state, pre)
-    seen, active = _centred(params, state, pre, spikes.hidden)
-    stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, seen, spikes.hidden, keep)
+    inputs, hidden = _centred(params, state, pre, spikes.hidden)
+    stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, inputs, spikes.hidden, keep)
     stdp_output, second = jax.vmap(stdp_window, in_axes=(None, 0, 1, 1, None))(
         stdp,
         state.stdp_output,
-        active.reshape(-1, 2, config.n_half),
+        hidden.reshape(-1, 2, config.n_half),
         spikes.output[:, :, None],
         keep,
     )
     duration = pre.shape[0] * config.dt
-    usual = _used_to(params, state, pre.mean(axis=0), spikes.hidden.mean(axis=0), duration)
+    rates = pre.mean(axis=0), spikes.hidden.mean(axis=0)
+    baselines = _update_baselines(params, state, *rates, duration)
     state = NetworkState(
-        state.weights, state.hidden, state.output, stdp_hidden, stdp_output, *usual
+        state.weights, state.hidden, state.output, stdp_hidden, stdp_output, *baselines
     )
-    held = Eligibility(
+    eligibility = Eligibility(
         hidden=first,
         output=second[..., 0],
         hidden_count=jnp.sum(spikes.hidden, axis=0),
         output_count=jnp.sum(spikes.output, axis=0),
         duration=duration,
     )
-    return state, held, spikes
+    return state, eligibility, spikes
 
 
 def reinforce(
@@ -337,11 +365,12 @@ def reinforce(
     Source:
         Shim (2020), Eq. 2.3 or 2.8 with the sign adjustment of section 2.3.2. Homeostasis is ours.
     """
-    sign_pre, sign_hidden = (jnp.asarray(s) for s in neuron_signs(config))
+    dtype = weights.hidden.dtype
+    sign_pre, sign_hidden = (jnp.asarray(s, dtype) for s in neuron_signs(config))
     to_first, to_second = synapse_signs(sign_pre, sign_hidden)
     gamma, eta = active * params.gamma, active * params.homeostasis
     # A product, so that the reward is worked out once and not anew for every synapse.
-    halves = jnp.repeat(jnp.eye(2), config.n_half, axis=1)
+    halves = jnp.repeat(jnp.eye(2, dtype=dtype), config.n_half, axis=1)
     by_neuron = gamma * (reward @ halves)
     drives = Weights(
         hidden=to_first * by_neuron[None, :] * eligibility.hidden,
@@ -359,9 +388,10 @@ def reinforce(
         output=weights.output * jnp.exp(short_output[:, None] * sign_hidden.reshape(2, -1)),
     )
     bounds = weight_bounds(config, params)
-    return Weights(
+    changed = Weights(
         *(
             apply_reward(w, d, params.w_min, top, rule=config.rule, bounds=config.bounds)
             for w, d, top in zip(scaled, drives, bounds, strict=True)
         )
     )
+    return jax.tree.map(lambda new, old: new.astype(old.dtype), changed, weights)

@@ -12,7 +12,14 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsnn._checks import concrete, require, require_finite, require_positive
+from jaxsnn._checks import (
+    concrete,
+    default_float,
+    require,
+    require_finite,
+    require_positive,
+    require_whole,
+)
 
 __all__ = ["LIFParams", "LIFState", "check_lif", "lif_init", "lif_scan", "lif_step"]
 
@@ -26,7 +33,8 @@ class LIFParams(NamedTuple):
         v_reset: potential after a spike [mV].
         v_th: a neuron whose potential exceeds this fires [mV].
         resistance: `R`, membrane resistance [MOhm], so that `R I` is in mV for `I` in nA.
-        t_ref: refractory time [s]; the membrane neither leaks nor integrates meanwhile.
+        t_ref: refractory time [s], below one second; the membrane neither leaks nor integrates
+            meanwhile. One that is no multiple of the step is rounded down to one, as in Brian 2.
     """
 
     tau_m: float | Array = 20e-3
@@ -49,7 +57,8 @@ def check_lif(params: LIFParams, *, dt: float) -> None:
 
     Raises:
         ValueError: a time constant is not positive, the step is unstable (`dt >= 2 tau_m`), the
-            reset is not below the threshold, or a value is not finite.
+            reset is not below the threshold, a refractory time is one second or more (surely
+            milliseconds), or a value is not finite.
     """
     require_positive("dt", dt, "give the step in seconds, 1e-3 for one millisecond")
     require_positive("tau_m", params.tau_m, "give it in seconds, 20e-3 for twenty milliseconds")
@@ -60,23 +69,31 @@ def check_lif(params: LIFParams, *, dt: float) -> None:
     if tau is not None:
         require(
             bool(dt < 2 * tau.min()),
-            f"dt = {dt} s is not below 2 tau_m = {2 * tau.min()} s: the Euler step would oscillate "
-            "and grow; take a smaller dt or a longer tau_m",
+            f"dt={dt}: expected a step below 2 tau_m = {2 * tau.min():g} s, or the Euler step "
+            "oscillates and grows; take a smaller dt or a longer tau_m",
+        )
+    refractory = concrete(params.t_ref)
+    if refractory is not None:
+        require(
+            bool((refractory < 1.0).all()),
+            f"t_ref={refractory.max():g}: expected less than one second; give it in seconds, 2e-3 "
+            "for two milliseconds",
         )
     reset, threshold = concrete(params.v_reset), concrete(params.v_th)
     if reset is not None and threshold is not None:
         require(
             bool((reset < threshold).all()),
-            f"v_reset = {params.v_reset} is not below v_th = {params.v_th}: a neuron would fire "
+            f"v_reset={params.v_reset}: expected less than v_th = {params.v_th}, or a neuron fires "
             "for ever; lower v_reset",
         )
 
 
 def lif_init(params: LIFParams, n: int) -> LIFState:
-    """`n` neurons at rest, none of them refractory."""
-    require(n > 0, f"n = {n}: a layer needs at least one neuron")
-    v = jnp.full((n,), 1.0, jnp.float32) * jnp.asarray(params.v_rest, jnp.float32)
-    return LIFState(v=v, refractory=jnp.zeros((n,), jnp.float32))
+    """`n` neurons at rest, none of them refractory, in jax's default float (float64 under x64)."""
+    require_whole("n", n, 1, "a layer needs at least one neuron")
+    dtype = default_float()
+    v = jnp.full((n,), 1.0, dtype) * jnp.asarray(params.v_rest, dtype)
+    return LIFState(v=v, refractory=jnp.zeros((n,), dtype))
 
 
 def lif_step(
@@ -104,7 +121,10 @@ def lif_step(
         dt: step [s].
 
     Returns:
-        The new state and the spikes of this step, `[n]` bool.
+        The new state, of the dtype of the old one, and the spikes of this step, `[n]` bool.
+
+    Raises:
+        ValueError: a constant with which the step cannot work, see `check_lif`.
 
     Source: Shim (2020), Eq. 2.1; order of operations as in Brian 2 with `(unless refractory)`.
 
@@ -115,15 +135,19 @@ def lif_step(
         >>> lif_step(params, state, 0.0, jnp.zeros(2), dt=1e-3)[1].tolist()
         [False, True]
     """
+    check_lif(params, dt=dt)
     left = jnp.maximum(state.refractory - dt, 0.0)
-    # Half a step of slack: t_ref / dt is an integer only up to rounding.
+    # Half a step of slack: what is left is a multiple of dt only up to rounding.
     active = left <= 0.5 * dt
     v = state.v + (dt / params.tau_m) * (params.v_rest - state.v + params.resistance * current)
     v = jnp.where(active, v, state.v)
     spikes = active & (v > params.v_th)
     v = jnp.where(active, v + jump, v)
     v = jnp.where(spikes, params.v_reset, v)
-    return LIFState(v=v, refractory=jnp.where(spikes, params.t_ref, left)), spikes
+    # Whole steps, rounded down, with the thousandth of a step of slack that Brian 2 has.
+    pause = jnp.floor(jnp.asarray(params.t_ref, left.dtype) / dt + 1e-3) * dt
+    left = jnp.where(spikes, pause, left)
+    return LIFState(v.astype(state.v.dtype), left.astype(state.refractory.dtype)), spikes
 
 
 def lif_scan(

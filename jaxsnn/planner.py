@@ -13,7 +13,7 @@ from collections.abc import Sequence
 import numpy as np
 
 from jaxsnn import geometry
-from jaxsnn.world import Params
+from jaxsnn.world import WorldParams
 
 __all__ = ["Obstacles", "PathField", "check_pose", "path_field", "shortest_path"]
 
@@ -36,7 +36,7 @@ class Obstacles:
     bounds: np.ndarray  # [4]
 
     @classmethod
-    def of(cls, params: Params) -> Obstacles:
+    def of(cls, params: WorldParams) -> Obstacles:
         """What stands still on a map."""
         still = np.asarray(params.segment_mask) & ~np.any(np.asarray(params.segment_velocity), 1)
         rest = np.asarray(params.circle_mask) & ~np.any(np.asarray(params.circle_velocity), 1)
@@ -148,7 +148,9 @@ class PathField:
         start = np.asarray(start, np.float64)
         length, node = self._from(start)
         if not math.isfinite(length):
-            raise ValueError(f"no path from {start.tolist()} to the target; choose another start")
+            raise ValueError(
+                f"start={start.tolist()}: expected a path to the target; choose another start"
+            )
         points = [start]
         while node >= 0:
             points.append(self.nodes[node])
@@ -175,7 +177,7 @@ class PathField:
         return math.inf, -1
 
 
-def path_field(params: Params, *, clearance: int | float | None = None) -> PathField:
+def path_field(params: WorldParams, *, clearance: int | float | None = None) -> PathField:
     """Plan from everywhere: a visibility graph over the grown obstacles, and Dijkstra from the
     target.
 
@@ -225,7 +227,7 @@ def path_field(params: Params, *, clearance: int | float | None = None) -> PathF
 
 
 def shortest_path(
-    params: Params, start: Point, *, clearance: int | float | None = None
+    params: WorldParams, start: Point, *, clearance: int | float | None = None
 ) -> tuple[float, np.ndarray]:
     """Length [px] and way points `[k, 2]` of the shortest collision-free path from one start.
 
@@ -243,7 +245,7 @@ def shortest_path(
     return float(field.lengths(np.asarray([start]))[0]), points
 
 
-def check_pose(params: Params, position: Point) -> None:
+def check_pose(params: WorldParams, position: Point) -> None:
     """Refuse a position where the robot would stand in an obstacle or in a wall.
 
     Raises:
@@ -251,11 +253,12 @@ def check_pose(params: Params, position: Point) -> None:
     """
     point = np.asarray(position, np.float64)
     if point.shape != (2,) or not np.isfinite(point).all():
-        raise ValueError(f"position {position!r} must be two finite numbers (x, y)")
+        raise ValueError(f"position={position!r}: expected two finite numbers (x, y); check it")
     room = float(Obstacles.of(params).clearance(point[None], point[None])[0])
     radius = float(params.robot_radius)
     if room < radius:
         where = "inside an obstacle or wall" if room < 0 else f"{room:.1f} px from the nearest one"
         raise ValueError(
-            f"the robot (radius {radius:g}) at {point.tolist()} would be {where}; move the start"
+            f"position={point.tolist()}: expected {radius:g} px free for the robot, it would be "
+            f"{where}; move it"
         )

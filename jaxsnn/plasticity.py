@@ -9,11 +9,20 @@ from __future__ import annotations
 
 from typing import Literal, NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from jaxsnn._checks import concrete, require, require_finite, require_positive
+from jaxsnn._checks import (
+    concrete,
+    default_float,
+    require,
+    require_choice,
+    require_finite,
+    require_positive,
+    require_whole,
+)
 
 __all__ = [
     "STDPParams",
@@ -98,16 +107,18 @@ def check_bounds(
     excess = np.maximum(low - values, values - high)
     require(
         bool((excess <= 0).all()),
-        f"{name} holds {values.flat[excess.argmax()]:g} mV, outside [w_min, w_max] = "
+        f"{name}={values.flat[excess.argmax()]:g}: expected mV inside [w_min, w_max] = "
         f"[{low.min():g}, {high.max():g}]; clip them or change the bounds",
     )
 
 
 def stdp_init(n_pre: int, n_post: int) -> STDPState:
-    """No spikes so far: traces and eligibility are zero."""
-    require(n_pre > 0 and n_post > 0, f"({n_pre}, {n_post}): both layers need a neuron")
-    traces = Traces(jnp.zeros((n_pre,), jnp.float32), jnp.zeros((n_post,), jnp.float32))
-    return STDPState(traces=traces, z=jnp.zeros((n_pre, n_post), jnp.float32))
+    """No spikes so far: traces and eligibility are zero, in jax's default float."""
+    require_whole("n_pre", n_pre, 1, "a layer needs at least one neuron")
+    require_whole("n_post", n_post, 1, "a layer needs at least one neuron")
+    dtype = default_float()
+    traces = Traces(jnp.zeros((n_pre,), dtype), jnp.zeros((n_post,), dtype))
+    return STDPState(traces=traces, z=jnp.zeros((n_pre, n_post), dtype))
 
 
 def stdp_step(
@@ -139,7 +150,10 @@ def stdp_step(
         dt: step [s].
 
     Returns:
-        The new STDPState.
+        The new STDPState, of the dtype of the old one.
+
+    Raises:
+        ValueError: a constant with which the step cannot work, see `check_stdp`.
 
     Source: Shim (2020), Eq. 2.4-2.7, after Florian (2007).
 
@@ -149,12 +163,14 @@ def stdp_step(
         >>> float(stdp_step(STDPParams(), state, none, one, dt=1e-3).z[0, 0]) > 0  # pre, then post
         True
     """
+    check_stdp(params, dt=dt)
     a_minus = params.a_minus * params.anti_causal
     p_plus = jnp.exp(-dt / params.tau_plus) * state.traces.p_plus + params.a_plus * pre
     p_minus = jnp.exp(-dt / params.tau_minus) * state.traces.p_minus + a_minus * post
     xi = p_plus[:, None] * post[None, :] + pre[:, None] * p_minus[None, :]
     z = jnp.exp(-dt / params.tau_z) * state.z + xi / params.tau_z
-    return STDPState(traces=Traces(p_plus, p_minus), z=z)
+    new = STDPState(traces=Traces(p_plus, p_minus), z=z)
+    return jax.tree.map(lambda a, b: a.astype(b.dtype), new, state)
 
 
 def apply_reward(
@@ -195,6 +211,9 @@ def apply_reward(
     Returns:
         The new weights.
 
+    Raises:
+        ValueError: an unknown rule or kind of bounds, or `w_min` above `w_max`.
+
     Source: Shim (2020), Eq. 2.3 and 2.8. Soft bounds are ours.
 
     Example:
@@ -202,13 +221,19 @@ def apply_reward(
         ...              rule="multiplicative").tolist()
         [2.0, 5.0]
     """
+    require_choice("rule", rule, ("additive", "multiplicative"))
+    require_choice("bounds", bounds, ("hard", "soft"))
+    low, high = concrete(w_min), concrete(w_max)
+    if low is not None and high is not None:
+        require(
+            bool((low <= high).all()),
+            f"w_min={low.max():g}: expected at most w_max = {high.min():g}; exchange them",
+        )
     if rule == "additive":
         if bounds == "hard":
             return jnp.clip(weights + drive, w_min, w_max)
         up = w_max - (w_max - weights) * jnp.exp(-jnp.maximum(drive, 0.0) / w_max)
         return w_min + (up - w_min) * jnp.exp(jnp.minimum(drive, 0.0) / w_max)
-    if rule != "multiplicative":
-        raise ValueError(f"rule = {rule!r}: expected 'additive' or 'multiplicative'")
     # exp overflows float32 beyond 88; a window that asks for e^20 has left the model anyway.
     growth = jnp.exp(jnp.clip(drive, -20.0, 20.0))
     if bounds == "hard":

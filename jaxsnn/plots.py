@@ -1,19 +1,18 @@
 """Pictures of maps, trials, learning curves, plasticity curves and spikes; the one file with
 matplotlib.
 
-Every function returns a `matplotlib.figure.Figure` that belongs to nobody's window; call its
-`savefig`. Only `trial_gif` writes a file itself.
+Every function returns a `matplotlib.figure.Figure` (`plot_trial` a `FuncAnimation`) that belongs
+to nobody's window; saving it is the caller's.
 """
 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from pathlib import Path
 from typing import Any
 
 import jax.numpy as jnp
 import numpy as np
-from matplotlib.animation import FuncAnimation, PillowWriter
+from matplotlib.animation import FuncAnimation
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 from matplotlib.patches import Circle, Polygon, Rectangle, Wedge
@@ -21,14 +20,13 @@ from matplotlib.patches import Circle, Polygon, Rectangle, Wedge
 from jaxsnn import planner, world
 
 __all__ = [
-    "draw_map",
-    "learning_curves",
-    "map_figure",
-    "rm_stdp_curves",
-    "spike_raster",
-    "stdp_curve",
-    "trajectories",
-    "trial_gif",
+    "plot_learning_curves",
+    "plot_maps",
+    "plot_rm_stdp_curves",
+    "plot_spike_raster",
+    "plot_stdp_curve",
+    "plot_trajectories",
+    "plot_trial",
 ]
 
 # Colour-blind safe (Okabe & Ito); black comes last.
@@ -54,7 +52,7 @@ def _open_spines(ax: Axes) -> None:
     ax.set_axisbelow(True)
 
 
-def draw_map(ax: Axes, params: world.Params, *, t: int = 0) -> list[Any]:
+def _draw_map(ax: Axes, params: world.WorldParams, *, t: int = 0) -> list[Any]:
     """Draw walls, obstacles (where they are at step `t`), start circles and the target.
 
     Returns:
@@ -83,8 +81,8 @@ def draw_map(ax: Axes, params: world.Params, *, t: int = 0) -> list[Any]:
     return patches
 
 
-def _shapes(params: world.Params, t: int) -> tuple[list[np.ndarray], np.ndarray]:
-    segments, circles = world.obstacles_at(jnp.asarray(t, jnp.int32), params)
+def _shapes(params: world.WorldParams, t: int) -> tuple[list[np.ndarray], np.ndarray]:
+    segments, circles = world.obstacles_at(params, jnp.asarray(t, jnp.int32))
     shown = planner.Obstacles(
         np.asarray(segments, np.float64)[np.asarray(params.segment_mask)],
         np.asarray(circles, np.float64)[np.asarray(params.circle_mask)],
@@ -93,7 +91,7 @@ def _shapes(params: world.Params, t: int) -> tuple[list[np.ndarray], np.ndarray]
     return shown.loops(), shown.circles
 
 
-def map_figure(maps: Mapping[str, world.Params], *, columns: int = 3) -> Figure:
+def plot_maps(maps: Mapping[str, world.WorldParams], *, columns: int = 3) -> Figure:
     """Several maps side by side, each under its name."""
     columns = min(columns, len(maps))
     rows = -(-len(maps) // columns)
@@ -102,7 +100,7 @@ def map_figure(maps: Mapping[str, world.Params], *, columns: int = 3) -> Figure:
     for ax in grid.flat:
         ax.set_axis_off()
     for ax, (name, params) in zip(grid.flat, maps.items(), strict=False):
-        draw_map(ax, params)
+        _draw_map(ax, params)
         ax.set_title(name)
     return figure
 
@@ -111,8 +109,8 @@ def _end(arrived: bool, collided: bool) -> str:
     return "arrived" if arrived else "collided" if collided else "open"
 
 
-def trajectories(
-    params: world.Params,
+def plot_trajectories(
+    params: world.WorldParams,
     paths: Sequence[np.ndarray],
     *,
     arrived: Sequence[bool],
@@ -137,11 +135,11 @@ def trajectories(
     """
     if not len(paths) == len(arrived) == len(collided):
         raise ValueError(
-            f"{len(paths)} paths, {len(arrived)} arrived and {len(collided)} collided flags; give "
-            "one flag of each kind for each path"
+            f"paths=<{len(paths)}>, arrived=<{len(arrived)}>, collided=<{len(collided)}>: expected "
+            "equal numbers; give one flag of each kind for each path"
         )
     figure, ax = _axes(ax, (6.0, 4.6))
-    draw_map(ax, params)
+    _draw_map(ax, params)
     if shortest:
         _, points = planner.shortest_path(params, np.asarray(paths[0], np.float64)[0].tolist())
         ax.plot(*points.T, "k--", linewidth=1.2, label="shortest path")
@@ -166,7 +164,7 @@ def trajectories(
     return figure
 
 
-def learning_curves(
+def plot_learning_curves(
     curves: Mapping[str, np.ndarray],
     *,
     window: int = 1,
@@ -210,7 +208,7 @@ def learning_curves(
     return figure
 
 
-def stdp_curve(lag: np.ndarray, change: np.ndarray, *, ax: Axes | None = None) -> Figure:
+def plot_stdp_curve(lag: np.ndarray, change: np.ndarray, *, ax: Axes | None = None) -> Figure:
     """Weight change against `t_post - t_pre` (Figure 2.2).
 
     Args:
@@ -218,10 +216,10 @@ def stdp_curve(lag: np.ndarray, change: np.ndarray, *, ax: Axes | None = None) -
         change: change of the weight for one such pair `[n]` [mV].
         ax: axes to draw in.
     """
-    return rm_stdp_curves(lag, {"": change}, ax=ax)
+    return plot_rm_stdp_curves(lag, {"": change}, ax=ax)
 
 
-def rm_stdp_curves(
+def plot_rm_stdp_curves(
     lag: np.ndarray, changes: Mapping[str, np.ndarray], *, ax: Axes | None = None
 ) -> Figure:
     """Weight change against `t_post - t_pre`, one curve for each reward (Figure 2.3).
@@ -246,7 +244,7 @@ def rm_stdp_curves(
     return figure
 
 
-def spike_raster(
+def plot_spike_raster(
     spikes: Mapping[str, np.ndarray],
     weights: Mapping[str, np.ndarray] | None = None,
     *,
@@ -293,9 +291,8 @@ def spike_raster(
     return figure
 
 
-def trial_gif(
-    file: str | Path,
-    params: world.Params,
+def plot_trial(
+    params: world.WorldParams,
     path: np.ndarray,
     headings: np.ndarray,
     *,
@@ -304,11 +301,10 @@ def trial_gif(
     collided: bool = False,
     title: str = "",
     fps: int = 12,
-) -> Path:
-    """Write an animated GIF of one trial: the robot, its trail, what its sonars see.
+) -> FuncAnimation:
+    """One trial as an animation: the robot, its trail, what its sonars see.
 
     Args:
-        file: where to write.
         params: the map; moving obstacles move.
         path: positions `[steps, 2]` [px].
         headings: `[steps]` [rad].
@@ -319,7 +315,7 @@ def trial_gif(
         fps: frames per second; one frame is one control step, and the last one stays for a second.
 
     Returns:
-        The path of the file.
+        The animation; `animation.save(file, writer=PillowWriter(fps=fps))` makes a GIF of it.
 
     Raises:
         ValueError: the lengths of path, headings and sonar differ, or there is no step.
@@ -331,12 +327,12 @@ def trial_gif(
         or (sonar is not None and len(sonar) != len(path))
     ):
         raise ValueError(
-            f"path has {len(path)} steps, headings {len(headings)}, sonar "
-            f"{'none' if sonar is None else len(sonar)}; they must be equal and at least 1"
+            f"path=<{len(path)} steps>, headings=<{len(headings)}>, sonar="
+            f"<{'none' if sonar is None else len(sonar)}>: expected equal numbers >= 1; cut them"
         )
     figure = Figure(figsize=(5.0, 4.0), layout="constrained")
     ax = figure.subplots()
-    obstacles = draw_map(ax, params)
+    obstacles = _draw_map(ax, params)
     ax.set_title(title)
     (trail,) = ax.plot([], [], "-", color=COLOURS[0], linewidth=1.4)
     rays = [ax.plot([], [], "-", color=COLOURS[4], linewidth=0.8)[0] for _ in range(world.N_SONARS)]
@@ -372,8 +368,4 @@ def trial_gif(
         status.set_text(f"step {i}" + (end[_end(arrived, collided)] if last else ""))
         return [trail, body, nose, status, *rays, *obstacles]
 
-    animation = FuncAnimation(figure, frame, frames=len(path) + fps, blit=False)
-    file = Path(file)
-    file.parent.mkdir(parents=True, exist_ok=True)
-    animation.save(file, writer=PillowWriter(fps=fps), dpi=90)
-    return file
+    return FuncAnimation(figure, frame, frames=len(path) + fps, blit=False)

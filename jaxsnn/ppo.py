@@ -1,14 +1,14 @@
 """Proximal policy optimization in one compiled program: the modern reference on the same world.
 
-`make_train(config, env)` gives `train(key)`, a pure function of a key: vmap it over seeds, jit
-it as a whole. Environments are pairs of pure functions (`Env`); `jaxsnn.navigation`
+`make_train(config, env)` gives `train(params, key=key)`, a pure function: vmap it over seeds or
+constants, jit it as a whole. Environments are pairs of pure functions (`Env`); `jaxsnn.navigation`
 is the robot world as one. Robots that end a trial start the next one at once, from a fresh start.
 
 >>> import jax
 >>> from jaxsnn import navigation, ppo, scenarios
 >>> env = navigation.navigation_env(scenarios.scenario(1))
->>> train = jax.jit(ppo.make_train(ppo.Config(n_updates=100), env))
->>> result = train(jax.random.key(0))  # doctest: +SKIP
+>>> train = jax.jit(ppo.make_train(ppo.PPOConfig(n_updates=100), env))
+>>> result = train(ppo.PPOParams(), key=jax.random.key(0))  # doctest: +SKIP
 """
 
 from __future__ import annotations
@@ -24,14 +24,25 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Key
 
+from jaxsnn._checks import (
+    concrete,
+    require,
+    require_key,
+    require_keys,
+    require_positive,
+    require_whole,
+)
+
 __all__ = [
     "ActorCritic",
-    "Config",
     "Env",
+    "PPOConfig",
+    "PPOParams",
     "Result",
     "Rollout",
     "Transition",
     "act",
+    "check_ppo",
     "evaluate",
     "gae",
     "make_train",
@@ -58,39 +69,80 @@ class Env(NamedTuple):
 
 
 @dataclasses.dataclass(frozen=True)
-class Config:
-    """Sizes and constants; static."""
+class PPOConfig:
+    """Sizes and choices; static: a change compiles anew.
+
+    Attributes:
+        n_envs: robots that act at the same time.
+        n_steps: control steps of each of them per update.
+        n_updates, n_epochs, n_minibatches: updates; passes over the data of each, in minibatches.
+        anneal: let the learning rate fall to 0 over the training.
+        hidden: width of the layers of both networks.
+        initial_std: deviation of the action at the start.
+    """
 
     n_envs: int = 8
     n_steps: int = 64
     n_updates: int = 150
     n_epochs: int = 4
     n_minibatches: int = 4
-    learning_rate: float = 1e-3
     anneal: bool = True
-    discount: float = 0.98
-    gae_lambda: float = 0.95
-    clip: float = 0.2
-    value_coef: float = 0.5
-    entropy_coef: float = 0.0
-    max_grad_norm: float = 0.5
     hidden: tuple[int, ...] = (64, 64)
     initial_std: float = 0.6
 
     def __post_init__(self) -> None:
         """Refuse sizes that do not fit together."""
         for name in ("n_envs", "n_steps", "n_updates", "n_epochs", "n_minibatches"):
-            if getattr(self, name) < 1:
-                raise ValueError(f"{name} = {getattr(self, name)} must be at least 1")
-        if (self.n_envs * self.n_steps) % self.n_minibatches:
-            raise ValueError(
-                f"n_envs * n_steps = {self.n_envs * self.n_steps} transitions do not split into "
-                f"n_minibatches = {self.n_minibatches} equal parts; change one of them"
-            )
-        if not (0 < self.learning_rate < math.inf and 0 <= self.discount <= 1):
-            raise ValueError(
-                f"learning_rate = {self.learning_rate} must be > 0 and discount = {self.discount} "
-                "in [0, 1]"
+            require_whole(name, getattr(self, name), 1, "give at least one")
+        for width in self.hidden:
+            require_whole("hidden", width, 1, "give widths of layers")
+        require_positive("initial_std", self.initial_std, "0.6 is the default")
+        total = self.n_envs * self.n_steps
+        require(
+            total % self.n_minibatches == 0,
+            f"n_minibatches={self.n_minibatches}: expected a divisor of n_envs * n_steps = {total} "
+            "transitions; change one of them",
+        )
+
+
+class PPOParams(NamedTuple):
+    """Constants of the learner; leaves are floats that may be traced, so a sweep compiles once.
+
+    Attributes:
+        learning_rate: of Adam.
+        discount: `gamma`.
+        gae_lambda: `lambda` of the advantage estimates.
+        clip: largest change of the policy's ratio that still counts.
+        value_coef, entropy_coef: weights in the loss.
+        max_grad_norm: norm to which a gradient is cut.
+    """
+
+    learning_rate: float | Float[Array, ""] = 1e-3
+    discount: float | Float[Array, ""] = 0.98
+    gae_lambda: float | Float[Array, ""] = 0.95
+    clip: float | Float[Array, ""] = 0.2
+    value_coef: float | Float[Array, ""] = 0.5
+    entropy_coef: float | Float[Array, ""] = 0.0
+    max_grad_norm: float | Float[Array, ""] = 0.5
+
+
+def check_ppo(params: PPOParams) -> None:
+    """Refuse constants with which nothing is learnt; traced values pass.
+
+    Raises:
+        ValueError: names the constant, its value and the fix.
+    """
+    for name in ("learning_rate", "clip", "max_grad_norm"):
+        require_positive(name, getattr(params, name), "the default is a good start")
+    for name in ("value_coef", "entropy_coef"):
+        require_positive(name, getattr(params, name), "0 leaves the term out", zero=True)
+    for name in ("discount", "gae_lambda"):
+        require_positive(name, getattr(params, name), "give a number in [0, 1]", zero=True)
+        value = concrete(getattr(params, name))
+        if value is not None:
+            require(
+                bool((value <= 1.0).all()),
+                f"{name}={value.max():g}: expected a number in [0, 1]; lower it",
             )
 
 
@@ -108,9 +160,9 @@ class Rollout(NamedTuple):
 
 
 class Result(NamedTuple):
-    """What `train` returns."""
+    """What `train` returns: weights of the two networks, and what happened in each update."""
 
-    params: Any
+    weights: Any
     metrics: Rollout
 
 
@@ -137,7 +189,7 @@ class ActorCritic(nn.Module):
         return tower(self.action_size, 0.01), log_std, tower(1, 1.0)[..., 0]
 
 
-def _network(config: Config, env: Env) -> ActorCritic:
+def _network(config: PPOConfig, env: Env) -> ActorCritic:
     return ActorCritic(env.action_size, config.hidden, config.initial_std)
 
 
@@ -146,10 +198,10 @@ def _log_prob(action: Array, mean: Array, log_std: Array) -> Array:
     return jnp.sum(-0.5 * z**2 - log_std - 0.5 * math.log(2.0 * math.pi))
 
 
-def act(config: Config, env: Env, params: Any, obs: Float[Array, "o"]) -> Float[Array, "a"]:
+def act(config: PPOConfig, env: Env, weights: Any, obs: Float[Array, "o"]) -> Float[Array, "a"]:
     """The action without exploration: the mean of the policy."""
     apply: Any = _network(config, env).apply
-    return apply(params, obs)[0]
+    return apply(weights, obs)[0]
 
 
 def gae(
@@ -159,8 +211,8 @@ def gae(
     terminated: Array,
     ended: Array,
     *,
-    discount: float,
-    gae_lambda: float,
+    discount: float | Float[Array, ""],
+    gae_lambda: float | Float[Array, ""],
 ) -> Float[Array, "t"]:
     r"""Generalized advantage estimates of one stream of transitions.
 
@@ -186,21 +238,22 @@ def gae(
     return advantages
 
 
-def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
-    r"""PPO with the clipped objective, the whole run as one pure function of a key.
+def make_train(config: PPOConfig, env: Env) -> Callable[..., Result]:
+    r"""PPO with the clipped objective, the whole run as one pure function.
 
     .. math:: L = \mathbb{E}\,\min(\rho A,\, \operatorname{clip}(\rho, 1 - c, 1 + c) A)
         - c_v\,(V - \hat R)^2 + c_e H, \qquad \rho = \pi(a|s) / \pi_{\text{old}}(a|s)
 
-    Symbols: :math:`c` is `config.clip`, :math:`c_v` is `config.value_coef`, :math:`c_e` is
-    `config.entropy_coef`; :math:`A` from `gae`, normalized over each minibatch.
+    Symbols: :math:`c` is `params.clip`, :math:`c_v` is `params.value_coef`, :math:`c_e` is
+    `params.entropy_coef`; :math:`A` from `gae`, normalized over each minibatch.
 
     Args:
-        config: sizes and constants.
+        config: sizes and choices.
         env: the environment, reset to a fresh start whenever an episode ends.
 
     Returns:
-        `train(key) -> Result`: network parameters, and metrics with leaves `[n_updates]`.
+        `train(params, *, key) -> Result` with `PPOParams` and a typed key: network weights, and
+        metrics with leaves `[n_updates]`.
 
     Source: Schulman et al. (2017), Eq. 7 and 9; one jit for the run as in PureJaxRL (Lu et al.,
         2022).
@@ -208,19 +261,21 @@ def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
     network = _network(config, env)
     apply: Any = network.apply
     n_gradients = config.n_updates * config.n_epochs * config.n_minibatches
-    rate: Any = config.learning_rate
-    if config.anneal:
-        rate = optax.linear_schedule(config.learning_rate, 0.0, n_gradients)
-    optimizer = optax.chain(
-        optax.clip_by_global_norm(config.max_grad_norm), optax.adam(rate, eps=1e-5)
-    )
 
-    def value_of(params: Any, obs: Array) -> Array:
-        return apply(params, obs)[2]
+    def optimizer_of(params: PPOParams) -> optax.GradientTransformation:
+        rate: Any = params.learning_rate
+        if config.anneal:
+            rate = optax.linear_schedule(rate, 0.0, n_gradients)
+        return optax.chain(
+            optax.clip_by_global_norm(params.max_grad_norm), optax.adam(rate, eps=1e-5)
+        )
 
-    def robot_step(params: Any, state: Any, obs: Array, key: Array) -> tuple[Any, Array, Any]:
+    def value_of(weights: Any, obs: Array) -> Array:
+        return apply(weights, obs)[2]
+
+    def robot_step(weights: Any, state: Any, obs: Array, key: Array) -> tuple[Any, Array, Any]:
         k_action, k_reset = jax.random.split(key)
-        mean, log_std, value = apply(params, obs)
+        mean, log_std, value = apply(weights, obs)
         action = mean + jnp.exp(log_std) * jax.random.normal(k_action, mean.shape, mean.dtype)
         made = env.step(state, action)
         ended = made.terminated | made.truncated
@@ -232,7 +287,7 @@ def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
             "action": action,
             "log_prob": _log_prob(action, mean, log_std),
             "value": value,
-            "next_value": value_of(params, made.obs),
+            "next_value": value_of(weights, made.obs),
             "reward": made.reward,
             "terminated": made.terminated,
             "ended": ended,
@@ -240,48 +295,54 @@ def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
         }
         return *carry, row
 
-    def loss(params: Any, batch: dict[str, Array]) -> tuple[Array, dict[str, Array]]:
-        mean, log_std, value = jax.vmap(lambda o: apply(params, o))(batch["obs"])
+    def loss(
+        weights: Any, params: PPOParams, batch: dict[str, Array]
+    ) -> tuple[Array, dict[str, Array]]:
+        mean, log_std, value = jax.vmap(lambda o: apply(weights, o))(batch["obs"])
         log_prob = jax.vmap(_log_prob)(batch["action"], mean, log_std)
         log_ratio = log_prob - batch["log_prob"]
         ratio = jnp.exp(log_ratio)
         gain = batch["advantage"]
         gain = (gain - jnp.mean(gain)) / (jnp.std(gain) + 1e-8)
-        clipped = jnp.clip(ratio, 1.0 - config.clip, 1.0 + config.clip)
+        clipped = jnp.clip(ratio, 1.0 - params.clip, 1.0 + params.clip)
         policy_loss = -jnp.mean(jnp.minimum(ratio * gain, clipped * gain))
         value_loss = jnp.mean((value - batch["return"]) ** 2)
         entropy = jnp.mean(jnp.sum(log_std, axis=-1)) + 0.5 * env.action_size * math.log(
             2.0 * math.pi * math.e
         )
-        total = policy_loss + config.value_coef * value_loss - config.entropy_coef * entropy
+        total = policy_loss + params.value_coef * value_loss - params.entropy_coef * entropy
         return total, {
             "value_loss": value_loss,
             "policy_loss": policy_loss,
             "entropy": entropy,
             "kl": jnp.mean(ratio - 1.0 - log_ratio),
-            "clip_share": jnp.mean(jnp.abs(ratio - 1.0) > config.clip),
+            "clip_share": jnp.mean(jnp.abs(ratio - 1.0) > params.clip),
         }
 
-    def minibatch(carry: tuple[Any, Any], batch: dict[str, Array]) -> tuple[tuple[Any, Any], Any]:
-        params, moments = carry
-        grads, info = jax.grad(loss, has_aux=True)(params, batch)
-        updates, moments = optimizer.update(grads, moments, params)
-        return (optax.apply_updates(params, updates), moments), info
+    def update(params: PPOParams, carry: tuple[Any, ...]) -> tuple[tuple[Any, ...], Rollout]:
+        optimizer = optimizer_of(params)
+        weights, moments, states, obs, key = carry
 
-    def update(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], Rollout]:
-        params, moments, states, obs, key = carry
+        def minibatch(
+            carry: tuple[Any, Any], batch: dict[str, Array]
+        ) -> tuple[tuple[Any, Any], Any]:
+            weights, moments = carry
+            grads, info = jax.grad(loss, has_aux=True)(weights, params, batch)
+            updates, moments = optimizer.update(grads, moments, weights)
+            return (optax.apply_updates(weights, updates), moments), info
+
         key, k_act, k_shuffle = jax.random.split(key, 3)
 
         def control_step(now: tuple[Any, Array], step_key: Array) -> tuple[Any, Any]:
             keys = jax.random.split(step_key, config.n_envs)
-            states, obs, row = jax.vmap(robot_step, (None, 0, 0, 0))(params, *now, keys)
+            states, obs, row = jax.vmap(robot_step, (None, 0, 0, 0))(weights, *now, keys)
             return (states, obs), row
 
         (states, obs), rows = jax.lax.scan(
             control_step, (states, obs), jax.random.split(k_act, config.n_steps)
         )
         advantage = jax.vmap(
-            lambda *row: gae(*row, discount=config.discount, gae_lambda=config.gae_lambda),
+            lambda *row: gae(*row, discount=params.discount, gae_lambda=params.gae_lambda),
             in_axes=1,
             out_axes=1,
         )(rows["reward"], rows["value"], rows["next_value"], rows["terminated"], rows["ended"])
@@ -294,8 +355,8 @@ def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
             order = jax.random.permutation(k, total).reshape(config.n_minibatches, -1)
             return jax.lax.scan(minibatch, carry, jax.tree.map(lambda a: a[order], data))
 
-        (params, moments), info = jax.lax.scan(
-            epoch, (params, moments), jax.random.split(k_shuffle, config.n_epochs)
+        (weights, moments), info = jax.lax.scan(
+            epoch, (weights, moments), jax.random.split(k_shuffle, config.n_epochs)
         )
         metrics = Rollout(
             episodes=jnp.sum(rows["ended"]),
@@ -303,21 +364,25 @@ def make_train(config: Config, env: Env) -> Callable[[Key[Array, ""]], Result]:
             reward=jnp.mean(rows["reward"]),
             **{name: jnp.mean(value) for name, value in info.items()},
         )
-        return (params, moments, states, obs, key), metrics
+        return (weights, moments, states, obs, key), metrics
 
-    def train(key: Key[Array, ""]) -> Result:
+    def train(params: PPOParams, *, key: Key[Array, ""]) -> Result:
+        require_key(key)
+        check_ppo(params)
         k_init, k_reset, k_run = jax.random.split(key, 3)
         states, obs = jax.vmap(env.reset)(jax.random.split(k_reset, config.n_envs))
-        params = network.init(k_init, obs[0])
-        carry = (params, optimizer.init(params), states, obs, k_run)
-        carry, metrics = jax.lax.scan(update, carry, None, config.n_updates)
+        weights = network.init(k_init, obs[0])
+        carry = (weights, optimizer_of(params).init(weights), states, obs, k_run)
+        carry, metrics = jax.lax.scan(
+            lambda carry, _: update(params, carry), carry, None, config.n_updates
+        )
         return Result(carry[0], metrics)
 
     return train
 
 
 def evaluate(
-    config: Config, env: Env, params: Any, keys: Key[Array, "n"], *, max_steps: int
+    config: PPOConfig, env: Env, weights: Any, *, keys: Key[Array, "n"], max_steps: int
 ) -> tuple[Any, Array, Array]:
     """Episodes without exploration, frozen where they end.
 
@@ -325,13 +390,15 @@ def evaluate(
         config: the one that the parameters were trained with.
         env: the environment; path lengths make sense with a
             `jaxsnn.navigation.navigation_env`.
-        params: `Result.params`.
+        weights: `Result.weights`.
         keys: one for each episode.
         max_steps: steps to scan; the environment's own limit or more.
 
     Returns:
         (final states, success `[n]`, terminated `[n]`).
     """
+    require_keys(keys)
+    require_whole("max_steps", max_steps, 1, "allow at least one control step")
 
     def one(key: Array) -> tuple[Any, Array, Array]:
         state, obs = env.reset(key)
@@ -339,7 +406,7 @@ def evaluate(
 
         def body(carry: tuple[Any, ...], _: None) -> tuple[tuple[Any, ...], None]:
             state, obs, success, terminated, over = carry
-            made = env.step(state, act(config, env, params, obs))
+            made = env.step(state, act(config, env, weights, obs))
             state, obs = jax.tree.map(
                 lambda a, b: jnp.where(over, a, b), (state, obs), (made.state, made.obs)
             )

@@ -1,21 +1,28 @@
-"""Named settings of the networks: what the source says, and what we found to learn better.
+"""Presets of the networks: what the source says, and what we found to learn better.
 
-"literal" is the source wherever it speaks; what it leaves open (window, learning rate, time
-constant of the eligibility trace, threshold) has our values in both. "tuned" adds the readings and
-options below; `docs/snn_networks.md` says what each one does and how its value was chosen.
+The reading "literal" is the source wherever it speaks; what it leaves open (window, learning rate,
+time constant of the eligibility trace, threshold) has our values in both. "tuned" adds options;
+`docs/snn_networks.md` says what each one does and how its value was chosen.
 """
 
 from __future__ import annotations
 
 from typing import Any
 
-from jaxsnn.config import NetworkConfig, NetworkParams, network_config, network_params
+from jaxsnn._checks import require_choice
+from jaxsnn.config import (
+    NetworkConfig,
+    NetworkParams,
+    check_network,
+    network_config,
+    network_params,
+)
 from jaxsnn.plasticity import STDPParams
 
-__all__ = ["SETTINGS", "network_setting"]
+__all__ = ["READINGS", "preset"]
 
-# Per setting: changes of NetworkConfig, of NetworkParams, of STDPParams and of RewardParams.
-SETTINGS: dict[str, dict[str, dict[str, Any]]] = {
+# Per reading: changes of NetworkConfig, of NetworkParams, of STDPParams and of RewardParams.
+READINGS: dict[str, dict[str, dict[str, Any]]] = {
     "literal": {
         "config": {"control_steps": 400, "hold_steps": 100},
         "params": {"gamma": 7.5e-4},
@@ -51,39 +58,39 @@ GAMMA = {
 }
 
 
-def network_setting(
-    network: str,
-    setting: str = "tuned",
+def preset(
+    model: str,
+    reading: str = "tuned",
     *,
     config: dict[str, Any] | None = None,
     params: dict[str, Any] | None = None,
     stdp: dict[str, Any] | None = None,
     reward: dict[str, Any] | None = None,
 ) -> tuple[NetworkConfig, NetworkParams]:
-    """Configuration and constants of "S1" to "S4" in a named setting, with changes.
+    """Configuration and constants of "S1" to "S4" in a reading of the source, with changes.
 
     Args:
-        network: "S1", "S2", "S3" or "S4".
-        setting: "literal" or "tuned".
+        model: "S1", "S2", "S3" or "S4".
+        reading: "literal" or "tuned".
         config, params, stdp, reward: changes of single fields.
 
     Raises:
         ValueError: a name is unknown or a constant is not acceptable.
 
     Example:
-        >>> config, params = network_setting("S4", "literal")
+        >>> config, params = preset("S4", "literal")
         >>> params.stdp.anti_causal, params.reward.k
         (1.0, 1.3)
     """
-    if setting not in SETTINGS:
-        raise ValueError(f"setting = {setting!r}: expected one of {sorted(SETTINGS)}")
-    base = SETTINGS[setting]
-    built = network_config(network, **{**base["config"], **(config or {})})
+    require_choice("reading", reading, tuple(READINGS))
+    base = READINGS[reading]
+    built = network_config(model, **{**base["config"], **(config or {})})
     changes = dict(base["params"])
-    changes["gamma"] *= GAMMA[setting][network]
+    changes["gamma"] *= GAMMA[reading][model]
     constants = network_params(built, **{**changes, **(params or {})})
     constants = constants._replace(
         stdp=STDPParams(**{**base["stdp"], **(stdp or {})}),
         reward=constants.reward._replace(**{**base["reward"], **(reward or {})}),
     )
+    check_network(built, constants)
     return built, constants

@@ -14,14 +14,21 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
 
-from jaxsnn import world
+from jaxsnn import sensor_intervals, world
+from jaxsnn._checks import (
+    concrete,
+    require,
+    require_finite,
+    require_keys,
+    require_whole,
+)
 
 __all__ = [
     "ACTIONS",
     "N_STATES",
-    "Params",
+    "QParams",
     "Trials",
-    "default_params",
+    "check_q",
     "discretize",
     "init",
     "run_trials",
@@ -29,21 +36,32 @@ __all__ = [
 ]
 
 ACTIONS = (0.0, 30.0, -30.0)  # steering of forward, left, right [deg]
-N_STATES = 3**world.N_SONARS * 4 * 4
+N_STATES = (
+    sensor_intervals.N_SONAR**world.N_SONARS
+    * sensor_intervals.N_DISTANCE
+    * sensor_intervals.N_ANGLE
+)
 
-_SONAR_STEP = 100.0  # intervals 0-99, 100-199, 200-300 px
-_DISTANCE_STEP = 200.0  # four equal intervals of 0-800 px
 
+class QParams(NamedTuple):
+    """Constants of the learner; leaves may be traced, or differ between learners (`[n]`).
 
-class Params(NamedTuple):
-    """Constants of the learner; vmappable."""
+    Epsilon and the two rewards are the source's; learning rate and discount are ours.
 
-    learning_rate: Array  # [] alpha
-    discount: Array  # [] gamma
-    epsilon: Array  # [] chance of a random action
-    reward_arrival: Array  # []
-    reward_collision: Array  # []
-    reward_step: Array  # [] for each step that ends neither way
+    Attributes:
+        learning_rate: `alpha`.
+        discount: `gamma`.
+        epsilon: chance of a random action.
+        reward_arrival, reward_collision: rewards of the last step of a trial.
+        reward_step: reward of each step that ends neither way.
+    """
+
+    learning_rate: float | Float[Array, "*n"] = 0.1
+    discount: float | Float[Array, "*n"] = 0.9
+    epsilon: float | Float[Array, "*n"] = 0.3
+    reward_arrival: float | Float[Array, "*n"] = 2.0
+    reward_collision: float | Float[Array, "*n"] = -2.0
+    reward_step: float | Float[Array, "*n"] = 0.0
 
 
 class Trials(NamedTuple):
@@ -56,29 +74,22 @@ class Trials(NamedTuple):
     start: Array  # [..., 2] where it began [px]
 
 
-def default_params(
-    *,
-    learning_rate: float = 0.1,
-    discount: float = 0.9,
-    epsilon: float = 0.3,
-    reward_arrival: float = 2.0,
-    reward_collision: float = -2.0,
-    reward_step: float = 0.0,
-) -> Params:
-    """Epsilon and the two rewards of the source; learning rate and discount are ours.
+def check_q(params: QParams) -> None:
+    """Refuse rates outside [0, 1] and rewards that are not finite; traced values pass.
 
     Raises:
-        ValueError: a rate outside its range.
+        ValueError: names the constant, its value and the fix.
     """
-    for name, value, low, high in (
-        ("learning_rate", learning_rate, 0.0, 1.0),
-        ("discount", discount, 0.0, 1.0),
-        ("epsilon", epsilon, 0.0, 1.0),
-    ):
-        if not low <= value <= high:
-            raise ValueError(f"{name} = {value} must lie in [{low:g}, {high:g}]")
-    values = (learning_rate, discount, epsilon, reward_arrival, reward_collision, reward_step)
-    return Params(*(jnp.asarray(v, jnp.float32) for v in values))
+    for name in QParams._fields:
+        require_finite(name, getattr(params, name), "give a number")
+    for name in ("learning_rate", "discount", "epsilon"):
+        value = concrete(getattr(params, name))
+        if value is None:
+            continue
+        bad = value[(value < 0.0) | (value > 1.0)]
+        require(
+            not bad.size, f"{name}={bad.max(initial=-1.0)}: expected a number in [0, 1]; clip it"
+        )
 
 
 def discretize(reading: world.Reading) -> Int[Array, ""]:
@@ -87,17 +98,16 @@ def discretize(reading: world.Reading) -> Int[Array, ""]:
     .. math:: s = 16 \sum_{i=0}^{4} 3^i \lfloor s_i / 100 \rfloor
         + 4 \lfloor d / 200 \rfloor + \text{region}(\beta)
 
-    with every interval number held at its last one. Regions: 0 ahead (within 45 degrees), 1 left,
-    2 behind, 3 right.
+    with the intervals and regions of `jaxsnn.sensor_intervals`.
 
     Returns:
         Integer in [0, 3888).
 
     Source: Shim & Li (2017), section 2.4.2 and Fig. 2.4.
     """
-    sonar = jnp.clip(jnp.floor(reading.sonar / _SONAR_STEP), 0, 2).astype(jnp.int32)
-    distance = jnp.clip(jnp.floor(reading.distance / _DISTANCE_STEP), 0, 3).astype(jnp.int32)
-    region = jnp.floor((reading.angle + 45.0) / 90.0).astype(jnp.int32) % 4
+    sonar = sensor_intervals.sonar_interval(reading.sonar)
+    distance = sensor_intervals.distance_interval(reading.distance)
+    region = sensor_intervals.angle_region(reading.angle)
     powers = jnp.asarray([3**i for i in range(world.N_SONARS)], jnp.int32)
     return 16 * jnp.sum(sonar * powers) + 4 * distance + region
 
@@ -108,13 +118,12 @@ def init(n: int) -> Float[Array, "n s a"]:
     Raises:
         ValueError: there is no learner.
     """
-    if n < 1:
-        raise ValueError(f"n = {n} learners; ask for at least 1")
+    require_whole("n", n, 1, "ask for at least one learner")
     return jnp.zeros((n, N_STATES, len(ACTIONS)), jnp.float32)
 
 
 def td_target(
-    params: Params, reward: Float[Array, ""], over: Array, next_values: Float[Array, "a"]
+    params: QParams, reward: Float[Array, ""], over: Array, next_values: Float[Array, "a"]
 ) -> Float[Array, ""]:
     r"""What the entry of the table is drawn towards.
 
@@ -132,7 +141,7 @@ def td_target(
 class _Learner(NamedTuple):
     """What one learner carries from step to step, beside its table."""
 
-    robot: world.State
+    robot: world.WorldState
     row: Array  # row of the table for where it is
     trial: Array  # number of the trial
     length: Array  # path since the start of the trial
@@ -140,21 +149,21 @@ class _Learner(NamedTuple):
     key: Array
 
 
-def _begin(key: Array, trial: Array, params: world.Params) -> _Learner:
+def _begin(key: Array, trial: Array, map: world.WorldParams) -> _Learner:
     """Trial number `trial` of a learner; depends on its key and that number alone."""
     k_reset, k_act = jax.random.split(jax.random.fold_in(key, trial))
-    robot = world.reset(k_reset, params)
-    row = discretize(world.observe(robot, params))
+    robot = world.reset(map, key=k_reset)
+    row = discretize(world.observe(map, robot))
     start = jnp.stack([robot.x, robot.y])
     return _Learner(robot, row, trial, jnp.zeros_like(robot.x), start, k_act)
 
 
 def run_trials(
-    keys: Key[Array, "n"],
+    params: QParams,
+    map: world.WorldParams,
     tables: Float[Array, "n s a"],
-    q: Params,
-    params: world.Params,
     *,
+    keys: Key[Array, "n"],
     n_trials: int,
     max_steps: int,
     learn: bool,
@@ -164,42 +173,46 @@ def run_trials(
 
     .. math:: Q(s, a) \leftarrow Q(s, a) + \alpha\,(r + \gamma \max_{a'} Q(s', a') - Q(s, a))
 
-    Symbols: :math:`\alpha` is `q.learning_rate`, :math:`\gamma` is `q.discount`; the action is
-    random with chance `q.epsilon`, otherwise the best of the row, forward in a tie.
+    Symbols: :math:`\alpha` is `params.learning_rate`, :math:`\gamma` is `params.discount`; the
+    action is random with chance `params.epsilon`, otherwise the best of the row, forward in a tie.
 
     Args:
-        keys: one typed PRNG key for each learner; trial i uses `fold_in(key, i)`.
+        params: constants, leaves scalar or `[n]`.
+        map: the map.
         tables: from `init` or an earlier call.
-        q: constants, leaves scalar or `[n]`.
-        params: the map.
+        keys: one typed PRNG key for each learner; trial i uses `fold_in(key, i)`.
         n_trials: trials of each learner.
         max_steps: a trial that has not ended after so many control steps has failed.
         first_trial: number of the first trial, to go on where an earlier call ended.
-        learn: update the tables; set `q.epsilon` to 0 for a greedy test.
+        learn: update the tables; set `params.epsilon` to 0 for a greedy test.
 
     Returns:
         (tables, Trials).
 
     Raises:
-        ValueError: `n_trials` or `max_steps` is below 1.
+        ValueError: `n_trials` or `max_steps` is below 1, a constant is out of range, or the keys
+            are not one typed key per table.
 
     Source: Shim & Li (2017), section 2.4.3 (actions, epsilon). Its rewards for Q-learning, learning
     rate and discount are not given: arrival and collision are rewarded as in section 2.2.2.1.
     """
-    if n_trials < 1 or max_steps < 1:
-        raise ValueError(f"n_trials = {n_trials} and max_steps = {max_steps} must be at least 1")
+    require_whole("n_trials", n_trials, 1, "ask for at least one trial")
+    require_whole("max_steps", max_steps, 1, "allow at least one control step")
+    check_q(params)
+    require_keys(keys)
     n = tables.shape[0]
-    q = Params(*(jnp.broadcast_to(leaf, (n,)) for leaf in q))
-    steering = jnp.asarray(ACTIONS, params.speed.dtype)
+    require(keys.shape[0] == n, f"keys=<{keys.shape[0]}>: expected {n}, one per table; split more")
+    params = QParams(*(jnp.broadcast_to(jnp.asarray(leaf, tables.dtype), (n,)) for leaf in params))
+    steering = jnp.asarray(ACTIONS, map.speed.dtype)
     here = jnp.arange(n)
     first = jnp.asarray(first_trial, jnp.int32)
 
-    def one(learner: _Learner, root: Array, values: Array, q: Params) -> tuple[Any, ...]:
+    def one(learner: _Learner, root: Array, values: Array, q: QParams) -> tuple[Any, ...]:
         k_explore, k_action = jax.random.split(jax.random.fold_in(learner.key, learner.robot.t))
         explore = jax.random.uniform(k_explore) < q.epsilon
         random = jax.random.randint(k_action, (), 0, len(ACTIONS))
         action = jnp.where(explore, random, jnp.argmax(values).astype(random.dtype))
-        robot, outcome = world.step(learner.robot, steering[action], params)
+        robot, outcome = world.step(map, learner.robot, steering[action])
         over = outcome.collided | outcome.arrived
         reward = jnp.where(
             outcome.arrived,
@@ -209,11 +222,11 @@ def run_trials(
         moved = jnp.hypot(robot.x - learner.robot.x, robot.y - learner.robot.y)
         after = learner._replace(
             robot=robot,
-            row=discretize(world.observe(robot, params)),
+            row=discretize(world.observe(map, robot)),
             length=learner.length + moved,
         )
         ended = over | (robot.t >= max_steps)
-        fresh = _begin(root, learner.trial + 1, params)
+        fresh = _begin(root, learner.trial + 1, map)
         carry = jax.tree.map(lambda a, b: jnp.where(ended, a, b), fresh, after)
         return action, reward, over, ended, outcome, after, carry
 
@@ -222,18 +235,18 @@ def run_trials(
         busy = learners.trial - first < n_trials
         values = tables[here, learners.row]
         action, reward, over, ended, outcome, after, carry = jax.vmap(one)(
-            learners, keys, values, q
+            learners, keys, values, params
         )
         if learn:
-            target = jax.vmap(td_target)(q, reward, over, tables[here, after.row])
-            change = q.learning_rate * (target - values[here, action])
+            target = jax.vmap(td_target)(params, reward, over, tables[here, after.row])
+            change = params.learning_rate * (target - values[here, action])
             change = jnp.where(busy, change, jnp.zeros_like(change))
             tables = tables.at[here, learners.row, action].add(change)
         # A learner that is through writes past the end, which is dropped.
         slot = jnp.where(busy & ended, learners.trial - first, n_trials)
 
-        def write(held: Array, value: Array) -> Array:
-            return held.at[here, slot].set(value, mode="drop")
+        def write(old: Array, value: Array) -> Array:
+            return old.at[here, slot].set(value, mode="drop")
 
         done = Trials(
             outcome.arrived, outcome.collided, after.robot.t, after.length, learners.start
@@ -243,13 +256,13 @@ def run_trials(
     def going(loop: tuple[_Learner, Array, Trials]) -> Array:
         return jnp.any(loop[0].trial - first < n_trials)
 
-    learners = jax.vmap(lambda k: _begin(k, first, params))(keys)
+    learners = jax.vmap(lambda k: _begin(k, first, map))(keys)
     empty = Trials(
         arrived=jnp.zeros((n, n_trials), bool),
         collided=jnp.zeros((n, n_trials), bool),
         steps=jnp.zeros((n, n_trials), jnp.int32),
-        length=jnp.zeros((n, n_trials), params.speed.dtype),
-        start=jnp.zeros((n, n_trials, 2), params.speed.dtype),
+        length=jnp.zeros((n, n_trials), map.speed.dtype),
+        start=jnp.zeros((n, n_trials, 2), map.speed.dtype),
     )
     _, tables, trials = jax.lax.while_loop(going, body, (learners, tables, empty))
     return tables, trials

@@ -11,8 +11,8 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-from jaxsnn._checks import concrete, require, require_finite, require_positive
-from jaxsnn.encoding import angle_region
+from jaxsnn._checks import concrete, require, require_choice, require_finite, require_positive
+from jaxsnn.sensor_intervals import angle_region
 
 __all__ = [
     "RewardParams",
@@ -20,9 +20,9 @@ __all__ = [
     "check_rewards",
     "motor_rewards",
     "reward_params",
+    "scale_by_remaining_turn",
     "synapse_signs",
     "target_reward",
-    "tempered",
     "terminal_reward",
 ]
 
@@ -41,8 +41,8 @@ class RewardParams(NamedTuple):
         target_near_obstacle: factor on `r3` while an obstacle is within `d_safe`; 1 is the source.
             With 0, avoidance goes first; a wide vicinity of the target needs that, or the target
             pulls the robot through what is in between.
-        goal_angle: turn [deg] at which nothing is left to learn, see `tempered`; infinite in the
-            source.
+        goal_angle: turn [deg] at which nothing is left to learn, see `scale_by_remaining_turn`;
+            infinite in the source.
         commit: with 1, an obstacle that is nearest straight ahead rewards the turn that the robot
             makes anyway, whichever it is. The source names only obstacles on the right and on the
             left; before a wall the nearer side is a matter of chance, and what one step teaches the
@@ -68,8 +68,7 @@ def reward_params(rule: str, **changes: float) -> RewardParams:
         >>> reward_params("additive").k
         0.3
     """
-    if rule not in ("additive", "multiplicative"):
-        raise ValueError(f"rule = {rule!r}: expected 'additive' or 'multiplicative'")
+    require_choice("rule", rule, ("additive", "multiplicative"))
     return RewardParams(k=0.3 if rule == "additive" else 1.3)._replace(**changes)
 
 
@@ -84,7 +83,7 @@ def check_rewards(params: RewardParams) -> None:
     goal = concrete(params.goal_angle)
     require(
         goal is None or bool((goal > 0).all()),
-        f"goal_angle = {goal}: expected degrees > 0, or infinity for a reward without an end",
+        f"goal_angle={goal}: expected degrees > 0; give infinity for a reward without an end",
     )
     for name in ("collision", "arrival", "k", "r3_base", "opponent", "target_near_obstacle"):
         require_finite(name, getattr(params, name), "give a number")
@@ -169,10 +168,10 @@ def motor_rewards(
     return avoid + jnp.stack([to_left, to_right])
 
 
-def tempered(
+def scale_by_remaining_turn(
     params: RewardParams, reward: Float[Array, "2"], steering: Float[Array, ""]
 ) -> Float[Array, "2"]:
-    r"""A reward for turning, less what the turn has already reached: a reward prediction error.
+    r"""A reward for turning, scaled by the turn that is left to the goal: a prediction error.
 
     .. math:: r \leftarrow r \, \mathrm{clip}\left(1 - \frac{s \theta}{\theta_{goal}}, -1, 1\right),
               \qquad s = \mathrm{sign}(r_{right} - r_{left})
@@ -190,11 +189,11 @@ def tempered(
 
     Example:
         >>> params = RewardParams(goal_angle=60.0)
-        >>> tempered(params, jnp.array([-1.0, 1.0]), jnp.asarray(45.0)).tolist()
+        >>> scale_by_remaining_turn(params, jnp.array([-1.0, 1.0]), jnp.asarray(45.0)).tolist()
         [-0.25, 0.25]
     """
-    wanted = jnp.sign(reward[1] - reward[0])
-    return reward * jnp.clip(1.0 - wanted * steering / params.goal_angle, -1.0, 1.0)
+    side = jnp.sign(reward[1] - reward[0])
+    return reward * jnp.clip(1.0 - side * steering / params.goal_angle, -1.0, 1.0)
 
 
 def terminal_reward(

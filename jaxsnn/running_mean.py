@@ -1,4 +1,4 @@
-r"""What a presynaptic neuron usually fires, so that only the difference is learnt from.
+r"""Running mean of presynaptic rates, so that only the difference from it is learnt from.
 
 The eligibility trace of the source is a product of firing, so a synapse from a neuron that always
 fires is changed by every reward, and one from a neuron whose rate says which of two situations this
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
@@ -25,11 +26,11 @@ class Baseline(NamedTuple):
     """Mean spikes per step of each presynaptic neuron, and the time it was taken over [s]."""
 
     mean: Float[Array, " n"]
-    seen: Float[Array, ""]
+    duration: Float[Array, ""]
 
 
 def baseline_init(n: int) -> Baseline:
-    """Nothing seen yet."""
+    """Nothing observed yet."""
     return Baseline(jnp.zeros((n,)), jnp.zeros(()))
 
 
@@ -61,6 +62,7 @@ def baseline_update(
         >>> state.mean.tolist()
         [0.5]
     """
-    seen = state.seen + duration
-    share = jnp.maximum(-jnp.expm1(-duration / tau), duration / seen)
-    return Baseline(state.mean + share * (spikes - state.mean), seen)
+    total = state.duration + duration
+    share = jnp.maximum(-jnp.expm1(-duration / tau), duration / total)
+    new = Baseline(state.mean + share * (spikes - state.mean), total)
+    return jax.tree.map(lambda a, b: a.astype(b.dtype), new, state)

@@ -12,14 +12,14 @@ movements. The shortest paths here grow in the same order (mean 275, 377 and 345
 from __future__ import annotations
 
 import functools
-import math
 
 import jax
 
 from jaxsnn.maps import make_map
-from jaxsnn.world import Params
+from jaxsnn.shapes import box, mirrored, regular
+from jaxsnn.world import WorldParams
 
-__all__ = ["MAX_STEPS", "NAMES", "scenario"]
+__all__ = ["MAX_STEPS", "NAMES", "detour", "scenario"]
 
 NAMES = {1: "Scenario 1", 2: "Scenario 2", 3: "Scenario 3"}
 # A trial that has not ended after this many control steps has failed; about three times what the
@@ -27,37 +27,24 @@ NAMES = {1: "Scenario 1", 2: "Scenario 2", 3: "Scenario 3"}
 MAX_STEPS = 200
 
 
-def _box(x: int, y: int, width: int, height: int) -> list[tuple[float, float]]:
-    """Corners of an upright rectangle around (x, y)."""
-    w, h = width / 2, height / 2
-    return [(x - w, y - h), (x + w, y - h), (x + w, y + h), (x - w, y + h)]
-
-
-def _regular(x: int, y: int, radius: int, corners: int) -> list[tuple[float, float]]:
-    """Corners of a regular polygon that stands on a side."""
-    first = -math.pi / 2 + math.pi / corners
-    angles = [first + 2 * math.pi * i / corners for i in range(corners)]
-    return [(x + radius * math.cos(a), y + radius * math.sin(a)) for a in angles]
-
-
-def _scenario_1() -> Params:
+def _scenario_1() -> WorldParams:
     """Target in the centre, four equal boxes, an open lane from either side."""
     return make_map(
-        polygons=[_box(x, y, 80, 80) for x in (250, 550) for y in (150, 450)],
+        polygons=[box(x, y, 80, 80) for x in (250, 550) for y in (150, 450)],
         target=(400, 300),
         starts=[(90, 300, 40), (710, 300, 40)],
     )
 
 
-def _scenario_2() -> Params:
+def _scenario_2() -> WorldParams:
     """Obstacles of varying shapes between two lower start circles and a target further up."""
     return make_map(
         polygons=[
             [(140, 400), (240, 430), (160, 500)],
-            _regular(270, 255, 38, 6),
+            regular(270, 255, 38, 6),
             [(560, 420), (660, 420), (660, 445), (585, 445), (585, 520), (560, 520)],
-            _regular(545, 270, 40, 5),
-            _box(400, 90, 120, 40),
+            regular(545, 270, 40, 5),
+            box(400, 90, 120, 40),
         ],
         circles=[(400, 310, 35)],
         target=(400, 470),
@@ -65,17 +52,17 @@ def _scenario_2() -> Params:
     )
 
 
-def _scenario_3() -> Params:
+def _scenario_3() -> WorldParams:
     """More obstacles, one start circle in the bottom-right corner."""
     return make_map(
         polygons=[
-            _box(560, 400, 70, 50),
+            box(560, 400, 70, 50),
             [(395, 130), (465, 100), (450, 180)],
-            _regular(255, 215, 40, 6),
+            regular(255, 215, 40, 6),
             [(220, 390), (320, 390), (320, 415), (245, 415), (245, 480), (220, 480)],
-            _regular(660, 290, 34, 5),
-            _box(400, 480, 90, 40),
-            _box(110, 300, 50, 120),
+            regular(660, 290, 34, 5),
+            box(400, 480, 90, 40),
+            box(110, 300, 50, 120),
         ],
         circles=[(565, 190, 26), (250, 80, 35), (690, 480, 40)],
         target=(400, 300),
@@ -87,7 +74,7 @@ _SCENARIOS = {1: _scenario_1, 2: _scenario_2, 3: _scenario_3}
 
 
 @functools.cache
-def scenario(number: int) -> Params:
+def scenario(number: int) -> WorldParams:
     """The map of Scenario 1, 2 or 3.
 
     Raises:
@@ -97,7 +84,79 @@ def scenario(number: int) -> Params:
     (710.0, 90.0)
     """
     if number not in _SCENARIOS:
-        raise ValueError(f"scenario {number!r} does not exist; choose one of {sorted(_SCENARIOS)}")
+        raise ValueError(f"number={number!r}: expected one of {sorted(_SCENARIOS)}; choose one")
     # Concrete arrays even when a user asks for the map inside a function that is being traced.
     with jax.ensure_compile_time_eval():
         return _SCENARIOS[number]()
+
+
+def _detour_1() -> WorldParams:
+    """Target in the centre; before each start a wall with a lip, the way round is one-sided."""
+    wall = [(258, 600), (258, 165), (142, 165), (142, 145), (278, 145), (278, 600)]
+    hook = [(float(x), float(y)) for x, y in wall]
+    block = box(110, 500, 60, 50)
+    return make_map(
+        polygons=[hook, mirrored(hook), block, mirrored(block)],
+        target=(400, 300),
+        starts=[(90, 300, 40), (710, 300, 40)],
+    )
+
+
+def _detour_2() -> WorldParams:
+    """Obstacles of varying shapes, lower starts; a cup of its own across each straight way."""
+    return make_map(
+        polygons=[
+            [(368, 218), (161, 406), (75, 311), (88, 299), (162, 380), (342, 217), (256, 122),
+             (270, 110)],
+            [(634, 375), (457, 227), (512, 162), (526, 173), (483, 225), (632, 350), (711, 255),
+             (725, 266)],
+            [(590, 500), (650, 470), (645, 540)],
+            regular(400, 60, 26, 5),
+            regular(170, 520, 28, 6),
+        ],
+        circles=[(400, 250, 25)],
+        target=(400, 480),
+        starts=[(90, 100, 40), (710, 100, 40)],
+    )  # fmt: skip
+
+
+def _detour_3() -> WorldParams:
+    """More obstacles, one start circle in the bottom-right corner, a deep cup before it."""
+    return make_map(
+        polygons=[
+            [(527, 403), (380, 191), (553, 71), (564, 86), (405, 196), (532, 378), (630, 310),
+             (641, 324)],
+            regular(200, 190, 36, 6),
+            [(200, 490), (300, 490), (300, 510), (220, 510), (220, 560), (200, 560)],
+            regular(720, 330, 28, 5),
+            box(480, 510, 80, 36),
+            box(100, 320, 46, 110),
+        ],
+        circles=[(250, 70, 30), (690, 490, 36)],
+        target=(330, 400),
+        starts=[(710, 90, 40)],
+    )  # fmt: skip
+
+
+_DETOURS = {1: _detour_1, 2: _detour_2, 3: _detour_3}
+
+
+@functools.cache
+def detour(number: int) -> WorldParams:
+    """D1, D2 or D3: Scenarios 1 to 3 read so that the straight way fails.
+
+    What the text fixes is kept (target, start circles, kinds of obstacles). Drivers that learn
+    nothing, blind or with a reflex at 60 or 100 pixels, do not get through (`jaxsnn.drivers`), and
+    the shortest paths are nearer to the length of the source's trials, N_mv times 15 pixels.
+
+    Raises:
+        ValueError: there is no such map.
+
+    Example:
+        >>> detour(1).target.tolist()
+        [400.0, 300.0]
+    """
+    if number not in _DETOURS:
+        raise ValueError(f"number={number!r}: expected one of {sorted(_DETOURS)}; choose one")
+    with jax.ensure_compile_time_eval():
+        return _DETOURS[number]()

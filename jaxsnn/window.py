@@ -20,8 +20,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from jaxsnn._checks import require
-from jaxsnn.plasticity import STDPParams, STDPState, Traces, stdp_step
+from jaxsnn._checks import default_float, require, require_whole
+from jaxsnn.plasticity import STDPParams, STDPState, Traces, check_stdp, stdp_step
 
 __all__ = ["STDPKernel", "stdp_kernel", "stdp_steps", "stdp_window"]
 
@@ -58,11 +58,16 @@ def stdp_kernel(params: STDPParams, n_steps: int, *, dt: float) -> STDPKernel:
 
     Returns:
         STDPKernel; compute it once, outside the scan over windows.
+
+    Raises:
+        ValueError: a constant with which the steps cannot work, see `check_stdp`.
     """
-    require(n_steps > 0, f"n_steps = {n_steps}: a window needs at least one step")
+    require_whole("n_steps", n_steps, 1, "a window needs at least one step")
+    check_stdp(params, dt=dt)
     t = jnp.arange(n_steps)
     lag = t[:, None] - t[None, :]  # post step minus pre step
-    left = (n_steps - 1 - t).astype(jnp.float32)
+    dtype = default_float()
+    left = (n_steps - 1 - t).astype(dtype)
     rate_z, rate_plus, rate_minus = (
         dt / tau for tau in (params.tau_z, params.tau_plus, params.tau_minus)
     )
@@ -71,11 +76,11 @@ def stdp_kernel(params: STDPParams, n_steps: int, *, dt: float) -> STDPKernel:
     summed = jnp.expm1(-rate_z * (left + 1.0)) / jnp.expm1(-rate_z) * dt / params.tau_z
     weight = jnp.stack([at_end, summed])
     a_minus = params.a_minus * params.anti_causal
-    distance = jnp.abs(lag).astype(jnp.float32)
+    distance = jnp.abs(lag).astype(dtype)
     causal = jnp.where(lag >= 0, params.a_plus * jnp.exp(-rate_plus * distance), 0.0)
     anti = jnp.where(lag <= 0, a_minus * jnp.exp(-rate_minus * distance), 0.0)
     inner = weight[:, :, None] * causal[None] + weight[:, None, :] * anti[None]
-    since = (t + 1).astype(jnp.float32)  # steps since the traces at the window's start
+    since = (t + 1).astype(dtype)  # steps since the traces at the window's start
     old_plus = weight * jnp.exp(-rate_plus * since)[None]
     old_minus = weight * jnp.exp(-rate_minus * since)[None]
     top = jnp.concatenate([inner, old_plus[:, :, None]], axis=2)
@@ -114,8 +119,17 @@ def stdp_window(
         The state after the window and :math:`\int z\,dt` [mV], the sum over the `T` values of `z`
         after each step, times dt.
 
+    Raises:
+        ValueError: the kernel is for another number of steps than there are spikes.
+
     Source: Shim (2020), Eq. 2.4-2.7, summed over a window in closed form.
     """
+    steps = kernel.plus.shape[-1]
+    require(
+        pre.shape[0] == post.shape[0] == steps,
+        f"pre=<{pre.shape[0]} steps>, post=<{post.shape[0]} steps>: expected the {steps} steps of "
+        "the kernel; make it by stdp_kernel(params, steps, dt=dt) for this window",
+    )
     p_plus, p_minus = keep * state.traces.p_plus, keep * state.traces.p_minus
     pre_rows = jnp.concatenate([pre, p_plus[None]])
     post_rows = jnp.concatenate([post, p_minus[None]])
@@ -136,7 +150,9 @@ def stdp_window(
         p_minus=kernel.carry_minus * p_minus + kernel.minus @ post,
     )
     z = carry[0] * state.z + change[0]
-    return STDPState(traces=traces, z=z), carry[1] * state.z + change[1]
+    new = STDPState(traces=traces, z=z)
+    new = jax.tree.map(lambda a, b: a.astype(b.dtype), new, state)
+    return new, carry[1] * state.z + change[1]
 
 
 def stdp_steps(
@@ -150,9 +166,9 @@ def stdp_steps(
     """What `stdp_window` computes, step by step: the definition it is tested against."""
 
     def body(carry: tuple[STDPState, Array], spikes: tuple[Array, Array]) -> tuple:
-        held, total = carry
-        held = stdp_step(params, held, *spikes, dt=dt)
-        return (held, total + held.z * dt), None
+        traces, total = carry
+        traces = stdp_step(params, traces, *spikes, dt=dt)
+        return (traces, (total + traces.z * dt).astype(total.dtype)), None
 
     (state, total), _ = jax.lax.scan(body, (state, jnp.zeros_like(state.z)), (pre, post))
     return state, total

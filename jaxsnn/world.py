@@ -1,15 +1,15 @@
 """A robot with five sonars in a closed plane: kinematics, sensors, collision, arrival.
 
-Pure functions over two pytrees: `Params` is a map with all constants (vmap over it to run
-many maps at once, every map padded to the same size), `State` is what a control step
+Pure functions over two pytrees: `WorldParams` is a map with all constants (vmap over it to run
+many maps at once, every map padded to the same size), `WorldState` is what a control step
 changes.
 
 >>> import jax
 >>> from jaxsnn import scenarios, world
 >>> params = scenarios.scenario(1)
->>> state = world.reset(jax.random.key(0), params)
->>> reading = world.observe(state, params)
->>> state, outcome = world.step(state, 0.0, params)
+>>> state = world.reset(params, key=jax.random.key(0))
+>>> reading = world.observe(params, state)
+>>> state, outcome = world.step(params, state, 0.0)
 >>> bool(outcome.collided), bool(outcome.arrived)
 (False, False)
 
@@ -27,14 +27,15 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxsnn import geometry
+from jaxsnn._checks import require_key
 
 __all__ = [
     "N_SONARS",
     "Discs",
     "Outcome",
-    "Params",
     "Reading",
-    "State",
+    "WorldParams",
+    "WorldState",
     "observe",
     "observe_many",
     "obstacles_at",
@@ -46,7 +47,7 @@ __all__ = [
 N_SONARS = 5
 
 
-class Params(NamedTuple):
+class WorldParams(NamedTuple):
     """A map and the constants of its robot; made by `jaxsnn.maps.make_map`.
 
     Every leaf is an array, so maps of equal padding can be stacked and vmapped.
@@ -78,7 +79,7 @@ class Params(NamedTuple):
     sonar_stuck: Array  # [5] what a failed sonar reports [px]
 
 
-class State(NamedTuple):
+class WorldState(NamedTuple):
     """Pose of one robot, the number of control steps it has made, and its source of noise."""
 
     x: Array  # [] [px]
@@ -112,14 +113,14 @@ class Discs(NamedTuple):
     mask: Array  # [m] bool
 
 
-def _patrol(t: Array, params: Params) -> Array:
+def _patrol(t: Array, params: WorldParams) -> Array:
     """Steps away from the start of the patrol: 0 1 .. P .. 1 0 1 .., linear between whole steps."""
     period = jnp.maximum(params.patrol_steps, 1.0)
     return period - jnp.abs(jnp.mod(t.astype(period.dtype), 2.0 * period) - period)
 
 
 def obstacles_at(
-    t: Int[Array, ""], params: Params
+    params: WorldParams, t: Int[Array, ""]
 ) -> tuple[Float[Array, "s 4"], Float[Array, "c 3"]]:
     """Segments and circles where they are after `t` control steps, padding included."""
     steps = _patrol(t, params)
@@ -130,18 +131,19 @@ def obstacles_at(
 
 
 def reset(
-    key: Key[Array, ""], params: Params, *, circle: int | Int[Array, ""] | None = None
-) -> State:
+    params: WorldParams, *, key: Key[Array, ""], circle: int | Int[Array, ""] | None = None
+) -> WorldState:
     """A robot at a uniform point of a start circle, facing the target within `heading_spread`.
 
     Args:
-        key: typed PRNG key.
         params: the map.
+        key: typed PRNG key.
         circle: index of the start circle; drawn with `start_probs` when it is not given.
 
     Returns:
-        State at step 0.
+        WorldState at step 0.
     """
+    require_key(key)
     k_circle, k_radius, k_angle, k_heading, k_noise = jax.random.split(key, 5)
     dtype = params.starts.dtype
     if circle is None:
@@ -156,7 +158,7 @@ def reset(
     )
     towards = jnp.arctan2(params.target[1] - y, params.target[0] - x)
     heading = _wrap(towards + jnp.deg2rad(spread))
-    return State(x, y, heading, jnp.zeros((), jnp.int32), k_noise)
+    return WorldState(x, y, heading, jnp.zeros((), jnp.int32), k_noise)
 
 
 def _wrap(heading: Array) -> Array:
@@ -164,7 +166,7 @@ def _wrap(heading: Array) -> Array:
     return jnp.arctan2(jnp.sin(heading), jnp.cos(heading))
 
 
-def observe(state: State, params: Params, *, others: Discs | None = None) -> Reading:
+def observe(params: WorldParams, state: WorldState, *, others: Discs | None = None) -> Reading:
     r"""What the sensors report in a pose.
 
     .. math::
@@ -178,8 +180,8 @@ def observe(state: State, params: Params, *, others: Discs | None = None) -> Rea
     :math:`g` is `params.target`, :math:`u` the unit heading.
 
     Args:
-        state: one robot.
         params: the map.
+        state: one robot.
         others: other robots in the same world, which the sonars see.
 
     Returns:
@@ -190,7 +192,7 @@ def observe(state: State, params: Params, *, others: Discs | None = None) -> Rea
     the car is lost.
     """
     position = jnp.stack([state.x, state.y])
-    segments, circles = obstacles_at(state.t, params)
+    segments, circles = obstacles_at(params, state.t)
 
     def sonar(direction: Array) -> Array:
         seen = [
@@ -234,19 +236,19 @@ def observe(state: State, params: Params, *, others: Discs | None = None) -> Rea
 
 
 def _heading_and_move(
-    state: State, steering: Float[Array, ""], params: Params
+    state: WorldState, steering: Float[Array, ""], params: WorldParams
 ) -> tuple[Array, Array]:
     heading = _wrap(state.heading + jnp.deg2rad(steering))
     return heading, params.speed * jnp.stack([jnp.cos(heading), jnp.sin(heading)])
 
 
 def step(
-    state: State,
+    params: WorldParams,
+    state: WorldState,
     steering: int | float | Float[Array, ""],
-    params: Params,
     *,
     others: Discs | None = None,
-) -> tuple[State, Outcome]:
+) -> tuple[WorldState, Outcome]:
     r"""Turn by `steering`, then drive `speed` pixels ahead, up to the first contact.
 
     .. math::
@@ -260,14 +262,14 @@ def step(
     is jumped over at any speed.
 
     Args:
+        params: the map.
         state: one robot.
         steering: turn before the move [deg].
-        params: the map.
         others: other robots in the same world, which it can run into.
 
     Returns:
-        State after the step and its Outcome. When pose or steering is not finite the robot stays
-        where it is and `failed` is set.
+        WorldState after the step and its Outcome. When pose or steering is not finite the robot
+        stays where it is and `failed` is set.
 
     Source: Shim & Li (2017), section 2.4.3 (speed 15 px, steering angle in degrees).
     Deviation: there a negative angle is to the left.
@@ -276,7 +278,7 @@ def step(
     position = jnp.stack([state.x, state.y])
     finite = jnp.isfinite(steering) & jnp.isfinite(state.heading) & jnp.all(jnp.isfinite(position))
     heading, move = _heading_and_move(state, steering, params)
-    segments, circles = obstacles_at(state.t, params)
+    segments, circles = obstacles_at(params, state.t)
     gone = _patrol(state.t + 1, params) - _patrol(state.t, params)
 
     contacts = [
@@ -317,7 +319,7 @@ def step(
     collided = finite & jnp.isfinite(collision) & (collision < arrival)
     fraction = jnp.minimum(1.0, jnp.minimum(collision, arrival))
     reached = position + fraction * move
-    after = State(
+    after = WorldState(
         x=jnp.where(finite, reached[0], state.x),
         y=jnp.where(finite, reached[1], state.y),
         heading=jnp.where(finite, heading, state.heading),
@@ -327,11 +329,11 @@ def step(
     return after, Outcome(collided, arrived, ~finite)
 
 
-def _seen_by_each(states: State, moves: Array, active: Array) -> Discs:
+def _seen_by_each(states: WorldState, moves: Array, active: Array) -> Discs:
     """For each robot the discs of all others: leaves `[r, r, ...]`, itself masked out."""
     n = active.shape[0]
     if n == 0:
-        raise ValueError("there are 0 robots; states and active need at least one robot")
+        raise ValueError("robots=0: expected at least one robot; give one state for each")
     centres = jnp.stack([states.x, states.y], axis=1)
     return Discs(
         centres=jnp.broadcast_to(centres[None], (n, n, 2)),
@@ -340,12 +342,12 @@ def _seen_by_each(states: State, moves: Array, active: Array) -> Discs:
     )
 
 
-def observe_many(states: State, params: Params, *, active: Bool[Array, "r"]) -> Reading:
+def observe_many(params: WorldParams, states: WorldState, *, active: Bool[Array, "r"]) -> Reading:
     """Readings of several robots in one world, whose sonars see one another.
 
     Args:
-        states: leaves `[r, ...]`.
         params: one map, shared.
+        states: leaves `[r, ...]`.
         active: robots that take part; the others are not there.
 
     Returns:
@@ -353,21 +355,25 @@ def observe_many(states: State, params: Params, *, active: Bool[Array, "r"]) -> 
     """
     centres = jnp.stack([states.x, states.y], axis=1)
     discs = _seen_by_each(states, jnp.zeros_like(centres), active)
-    return jax.vmap(lambda s, o: observe(s, params, others=o))(states, discs)
+    return jax.vmap(lambda s, o: observe(params, s, others=o))(states, discs)
 
 
 def step_many(
-    states: State, steering: Float[Array, "r"], params: Params, *, active: Bool[Array, "r"]
-) -> tuple[State, Outcome]:
+    params: WorldParams,
+    states: WorldState,
+    steering: Float[Array, "r"],
+    *,
+    active: Bool[Array, "r"],
+) -> tuple[WorldState, Outcome]:
     """One control step of several robots in one world, which can run into one another.
 
     All move at once. Contact between two robots is exact for the moves that they set out on; a
     robot that something else stops earlier in the same step is still met where it was heading.
 
     Args:
+        params: one map, shared.
         states: leaves `[r, ...]`.
         steering: turn of each robot [deg].
-        params: one map, shared.
         active: robots that take part; the others stay as they are and are not there.
 
     Returns:
@@ -375,8 +381,8 @@ def step_many(
     """
     _, moves = jax.vmap(lambda s, a: _heading_and_move(s, a, params))(states, steering)
     discs = _seen_by_each(states, moves, active)
-    after, outcome = jax.vmap(lambda s, a, o: step(s, a, params, others=o))(states, steering, discs)
-    kept = State(
+    after, outcome = jax.vmap(lambda s, a, o: step(params, s, a, others=o))(states, steering, discs)
+    kept = WorldState(
         x=jnp.where(active, after.x, states.x),
         y=jnp.where(active, after.y, states.y),
         heading=jnp.where(active, after.heading, states.heading),

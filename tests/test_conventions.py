@@ -46,14 +46,6 @@ def test_the_rule_itself(code: str, good: bool) -> None:
 
 
 KNOWN_PLOTS = {
-    "jaxsnn.plots.draw_map",
-    "jaxsnn.plots.map_figure",
-    "jaxsnn.plots.trajectories",
-    "jaxsnn.plots.learning_curves",
-    "jaxsnn.plots.stdp_curve",
-    "jaxsnn.plots.rm_stdp_curves",
-    "jaxsnn.plots.spike_raster",
-    "jaxsnn.plots.trial_gif",
     "failure.plots.plot_trend",
     "failure.plots.plot_activity",
     "failure.plots.plot_shares",

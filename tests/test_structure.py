@@ -43,16 +43,14 @@ SAME_MEANING = {
     "presets": "settings of a part by name",
     "circuit": "a circuit as a search takes it",
     "reference": "a circuit in ngspice",
+    "status": "how a run ended, and what to do about it",
     "network": "neurons or filters and their connections",
     "geometry": "shapes, distances and overlaps",
     "__main__": "what `python -m` runs",
 }
 """Module names that may occur more than once, and the one thing they mean."""
 KNOWN_CIRCLES: set[tuple[str, str]] = set()
-KNOWN_LONG = {
-    "train_rl",
-    "train_snn",
-}
+KNOWN_LONG: set[str] = set()
 KNOWN_NAMES = {"files", "models", "failure", "runs", "commands", "folder"}
 KNOWN_HIDDEN = {"snn_fusion_failure.runs.provenance"}
 

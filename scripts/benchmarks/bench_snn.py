@@ -95,20 +95,20 @@ def window_program(robots: int, bench: Bench, control_steps: int) -> tuple[Any, 
 
     from jaxsnn import scenarios
     from jaxsnn.agents import snn_agent, snn_params
-    from jaxsnn.presets import network_setting
+    from jaxsnn.presets import preset
     from jaxsnn.trials import run_phase
 
     size = {"control_steps": bench.window, "hold_steps": bench.window}
-    config, constants = network_setting("S4", "tuned", config=size)
+    config, constants = preset("S4", "tuned", config=size)
     agent, params = snn_agent(config), snn_params(config, constants)
     # A robot that stands still neither arrives nor collides: every trial has all its steps.
-    place = scenarios.scenario(1)._replace(speed=jnp.zeros(()))
+    map = scenarios.scenario(1)._replace(speed=jnp.zeros(()))
     block = min(bench.block, robots)
 
     def run(states: Any, keys: Any) -> Any:
         def one(xs: tuple) -> tuple:
             return run_phase(
-                agent, params, place, *xs, n_trials=1, max_steps=control_steps
+                agent, params, map, xs[0], keys=xs[1], n_trials=1, max_steps=control_steps
             )  # fmt: skip
 
         cut = jax.tree.map(
@@ -148,13 +148,13 @@ def bench_step(robots: int, bench: Bench) -> float:
 
     from jaxsnn import network
     from jaxsnn.encoding import poisson_spikes
-    from jaxsnn.presets import network_setting
+    from jaxsnn.presets import preset
 
-    config, params = network_setting("S3", "tuned")
+    config, params = preset("S3", "tuned")
     length = 50
 
     def one(state: Any, key: Any) -> Any:
-        pre = poisson_spikes(key, jnp.full(config.n_in, 50.0), length, dt=config.dt)
+        pre = poisson_spikes(jnp.full(config.n_in, 50.0), length, key=key, dt=config.dt)
 
         def body(carry: Any, x: Any) -> tuple:
             return network.step(config, params, carry, x, jnp.array([1.0, -1.0]))
@@ -198,7 +198,7 @@ def accuracy_rows(seconds: float = 2.0) -> list[dict[str, Any]]:
 
     from jaxsnn import network
     from jaxsnn.encoding import poisson_spikes
-    from jaxsnn.presets import network_setting
+    from jaxsnn.presets import preset
 
     steps = round(seconds * 1000)
     reward = jnp.array([1.0, -1.0])
@@ -206,7 +206,7 @@ def accuracy_rows(seconds: float = 2.0) -> list[dict[str, Any]]:
     for speed, gamma in (("slow", 3e-4), ("fast", 3e-3)):
         changes: dict[int, tuple[Any, float]] = {}
         for hold in (1, 10, 50, 100):
-            config, params = network_setting(
+            config, params = preset(
                 "S4", "tuned",
                 config={"control_steps": hold, "hold_steps": hold},
                 params={"gamma": gamma, "homeostasis": 0.0, "centring": 0.0},
@@ -216,7 +216,7 @@ def accuracy_rows(seconds: float = 2.0) -> list[dict[str, Any]]:
             def run(params: Any, config: Any = config, hold: int = hold) -> Any:
                 state = network.init(jax.random.key(0), config, params)
                 rates = jnp.repeat(jnp.array([50.0, 100, 50, 0, 50, 50, 25]), 30)
-                pre = poisson_spikes(jax.random.key(1), rates, steps, dt=config.dt)
+                pre = poisson_spikes(rates, steps, key=jax.random.key(1), dt=config.dt)
                 start = state.weights.hidden
                 if hold == 1:
                     end, _ = jax.lax.scan(

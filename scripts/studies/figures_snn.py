@@ -25,8 +25,8 @@ PHASES = {"learning": 0, "testing": 1}
 class Figures:
     """What to draw."""
 
-    network: str = "S4"
-    setting: str = "tuned"
+    model: str = "S4"
+    reading: str = "tuned"
     seed: int = 0
     scenarios: tuple[int, ...] = (1, 2, 3)
     runs: Path = Path("runs/train_snn")
@@ -51,37 +51,38 @@ def draw_rules(config: Figures) -> None:
     seconds = jnp.asarray(lag * 1e-3, jnp.float32)
     params = plasticity.STDPParams()
     save(
-        plots.stdp_curve(lag, np.asarray(plasticity.stdp_curve(params, seconds))),
+        plots.plot_stdp_curve(lag, np.asarray(plasticity.stdp_curve(params, seconds))),
         config.out / "snn_stdp.png",
     )
     rewards = (2.0, 1.0, -1.0, -2.0)
     changes = plasticity.rm_stdp_curve(params, seconds, jnp.asarray(rewards))
     named = {f"reward {r:+g}": np.asarray(c) for r, c in zip(rewards, changes, strict=True)}
-    save(plots.rm_stdp_curves(lag, named), config.out / "snn_rm_stdp.png")
+    save(plots.plot_rm_stdp_curves(lag, named), config.out / "snn_rm_stdp.png")
 
 
 def draw_trajectories(config: Figures, scenario: int) -> Any:
     """Trials of both phases of one robot (2.9 to 2.14); returns the experiment."""
     from jaxsnn import plots, scenarios
-    from jaxsnn.presets import network_setting
-    from snn_fusion_failure.commands.train_snn import TEST_TRIALS, make_runner
+    from jaxsnn.experiment import TEST_TRIALS, learning_circles, make_runner
+    from jaxsnn.presets import preset
+    from jaxsnn.status import Status
 
-    built, params = network_setting(config.network, config.setting)
+    built, params = preset(config.model, config.reading)
+    map = scenarios.scenario(scenario)
     run = make_runner(
-        built, scenario, n_learn=20, n_test=TEST_TRIALS[scenario], n_online=0, max_steps=200,
-        block=1, record=True, keep_states=True,
+        built, map, n_learn=20, n_test=TEST_TRIALS[scenario], block=1,
+        circles=learning_circles(scenario, 20), record=True, keep_states=True,
     )  # fmt: skip
     experiment = run([config.seed], params)
-    place = scenarios.scenario(scenario)
     for name, index in PHASES.items():
         phase = experiment[index]
         steps, status = phase.steps[0], phase.status[0]
-        figure = plots.trajectories(
-            place,
+        figure = plots.plot_trajectories(
+            map,
             [phase.poses[0, i, : n + 1, :2] for i, n in enumerate(steps)],
-            arrived=[bool(s == 0) for s in status],
-            collided=[bool(s == 1) for s in status],
-            title=f"{config.network}, Scenario {scenario}, {name}",
+            arrived=[bool(s == Status.ARRIVED) for s in status],
+            collided=[bool(s == Status.COLLIDED) for s in status],
+            title=f"{config.model}, Scenario {scenario}, {name}",
         )
         save(figure, config.out / f"snn_scenario{scenario}_{name}.png")
     return experiment
@@ -92,35 +93,38 @@ def draw_trial(config: Figures, scenario: int, experiment: Any) -> None:
     import jax
     import jax.numpy as jnp
     import numpy as np
+    from matplotlib.animation import PillowWriter
 
     from jaxsnn import network, plots, scenarios, world
     from jaxsnn.config import neuron_signs
     from jaxsnn.encoding import group_rates, poisson_spikes
-    from jaxsnn.presets import network_setting
+    from jaxsnn.presets import preset
+    from jaxsnn.status import Status
 
-    place = scenarios.scenario(scenario)
+    map = scenarios.scenario(scenario)
     phase = experiment.testing
     trial = phase.steps.shape[1] - 1
     poses = phase.poses[0, trial, : phase.steps[0, trial] + 1]
 
     def look(pose: Any) -> Any:
         t, key = jnp.zeros((), jnp.int32), jax.random.key(0)
-        return world.observe(world.State(pose[0], pose[1], pose[2], t, key), place)
+        return world.observe(map, world.WorldState(pose[0], pose[1], pose[2], t, key))
 
     readings = jax.jit(jax.vmap(look))(jnp.asarray(poses))
-    plots.trial_gif(
-        config.out / "snn_trial.gif", place, poses[:, :2], poses[:, 2],
-        sonar=np.asarray(readings.sonar),
-        arrived=bool(phase.status[0, trial] == 0), collided=bool(phase.status[0, trial] == 1),
-        title=f"{config.network}, Scenario {scenario}, after 20 trials",
+    movie = plots.plot_trial(
+        map, poses[:, :2], poses[:, 2], sonar=np.asarray(readings.sonar),
+        arrived=bool(phase.status[0, trial] == Status.ARRIVED),
+        collided=bool(phase.status[0, trial] == Status.COLLIDED),
+        title=f"{config.model}, Scenario {scenario}, after 20 trials",
     )  # fmt: skip
+    movie.save(config.out / "snn_trial.gif", writer=PillowWriter(fps=12), dpi=90)
 
-    built, params = network_setting(config.network, config.setting)
+    built, params = preset(config.model, config.reading)
     state = jax.tree.map(lambda x: jnp.asarray(x[0]), experiment.states)
     first = jax.tree.map(lambda x: x[0], readings)
     rates = group_rates(built.rates, first.sonar, first.distance, first.angle)
     rates = jnp.repeat(rates, built.group_exc + built.group_inh)
-    pre = poisson_spikes(jax.random.key(1), rates, built.control_steps, dt=built.dt)
+    pre = poisson_spikes(rates, built.control_steps, key=jax.random.key(1), dt=built.dt)
     _, spikes = jax.jit(network.fire, static_argnums=0)(built, params, state, pre)
     sign_in, sign_hidden = neuron_signs(built)
     layers = {"input": pre, "hidden": spikes.hidden, "motors": spikes.output}
@@ -130,7 +134,7 @@ def draw_trial(config: Figures, scenario: int, experiment: Any) -> None:
         .reshape(2, -1)
         .T,
     }
-    figure = plots.spike_raster(
+    figure = plots.plot_spike_raster(
         {name: np.asarray(s, bool) for name, s in layers.items()}, weights, dt=1e3 * built.dt
     )
     save(figure, config.out / "snn_raster.png")
@@ -141,16 +145,17 @@ def draw_curves(config: Figures, scenario: int) -> bool:
     import numpy as np
 
     from jaxsnn import plots
+    from jaxsnn.status import Status
 
     curves = {}
     for network in ("S1", "S2", "S3", "S4"):
-        folder = config.runs / f"scenario{scenario}_{network}_{config.setting}" / "seeds"
+        folder = config.runs / f"scenario{scenario}_{network}_{config.reading}" / "seeds"
         records = [r for f in sorted(folder.glob("*.json")) for r in json.loads(f.read_text())]
         if records:
             status = np.array([r["learning"]["status"] for r in records])
-            curves[f"{network} ({len(records)} robots)"] = (status == 0).astype(float)
+            curves[f"{network} ({len(records)} robots)"] = (status == Status.ARRIVED).astype(float)
     if curves:
-        figure = plots.learning_curves(curves, window=3)
+        figure = plots.plot_learning_curves(curves, window=3)
         save(figure, config.out / f"snn_learning_scenario{scenario}.png")
     return bool(curves)
 

@@ -1,9 +1,9 @@
-"""Which readings and constants let a spiking network learn: variants around a setting, compared.
+"""Which readings and constants let a spiking network learn: variants around a reading, compared.
 
     python scripts/studies/study_snn.py --study readings --seeds 8 --scenario 2
-    python scripts/studies/study_snn.py --study gamma --network S2 --seeds 8 --max-minutes 30
+    python scripts/studies/study_snn.py --study gamma --model S2 --seeds 8 --max-minutes 30
 
-Every variant is a named setting (`literal` or `tuned`) with a few changes, run over the same seeds
+Every variant is a reading (`literal` or `tuned`) with a few changes, run over the same seeds
 on a training scenario; test maps and the seeds of the tables of record are never used. Rows go to
 `results/study_snn_STUDY.json` as each variant ends; a variant that is there already (same seeds) is
 skipped, so a study can be broken off and gone on with. About 3 CPU-seconds per seed and variant.
@@ -14,16 +14,17 @@ from __future__ import annotations
 import dataclasses
 import json
 import time
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from tyro.conf import arg
 
-from snn_fusion_failure.commands.train_snn import make_runner, metrics, parse_changes, per_seed
-from snn_fusion_failure.records.rows import record_table
+from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
+from snn_fusion_failure.runs.networks import changed_preset
 
 TITLE = "Variants of a network around a setting"
-# study -> variant -> (setting, changes)
+# study -> variant -> (reading, changes)
 STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     # One reading or option at a time: what the source says with one of ours, ours without one.
     "readings": {
@@ -89,7 +90,7 @@ class Study:
     study: Literal["readings", "gamma", "goal", "tau_z", "homeostasis", "rates", "window"] = (
         "readings"
     )
-    network: Literal["S1", "S2", "S3", "S4"] = "S4"
+    model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
     scenario: Literal[1, 2, 3] = 1
     seeds: int = 8
     first_seed: int = 1000
@@ -105,12 +106,13 @@ class Study:
 
 def main(config: Study) -> dict[str, Any]:
     """Run the variants that are missing; returns SR-testing by variant."""
-    from jaxsnn.presets import network_setting
+    from jaxsnn import scenarios, scores
+    from jaxsnn.experiment import learning_circles, make_runner
 
-    variants = STUDIES[config.study]
+    variants, map = STUDIES[config.study], scenarios.scenario(config.scenario)
     unknown = set(config.only) - set(variants)
     if unknown:
-        raise ValueError(f"only = {sorted(unknown)}: expected some of {sorted(variants)}")
+        raise ValueError(f"only={sorted(unknown)}: expected some of {sorted(variants)}; choose")
     enable_compilation_cache()
     path = repository.RESULTS / f"study_snn_{config.study}.json"
     held = set()
@@ -118,27 +120,27 @@ def main(config: Study) -> dict[str, Any]:
         for row in json.loads(path.read_text(encoding="utf-8"))["rows"]:
             if row["metric"] == "sr_testing" and row["n"] >= config.seeds:
                 held.add((row["row"], row["model"]))
-    model = f"{config.network} scenario {config.scenario}"
+    model = f"{config.model} scenario {config.scenario}"
     done: dict[str, float] = {}
     runners: dict[Any, Any] = {}
     start = time.process_time()
-    for name, (setting, changes) in variants.items():
+    for name, (reading, changes) in variants.items():
         if (config.only and name not in config.only) or (name, model) in held:
             continue
         if time.process_time() - start > 60 * config.max_minutes:
             break
-        built, params = network_setting(config.network, setting, **parse_changes(changes))
+        built, params = changed_preset(config.model, reading, changes)
         if built not in runners:
             runners[built] = make_runner(
-                built, config.scenario, n_learn=20, n_test=config.test_trials, n_online=0,
-                max_steps=config.max_steps, block=config.block, record=False,
+                built, map, n_learn=20, n_test=config.test_trials, max_steps=config.max_steps,
+                block=config.block, circles=learning_circles(config.scenario, 20),
             )  # fmt: skip
         numbers = list(range(config.first_seed, config.first_seed + config.seeds))
         experiment = runners[built](numbers, params)
-        records = per_seed(experiment, numbers)
-        summary = metrics(records)
+        records = scores.per_seed(experiment, numbers)
+        summary = {k: summarize(v) for k, v in scores.score(records).items() if v}
         rows = [
-            {"row": name, "model": model, "metric": metric, "setting": setting,
+            {"row": name, "model": model, "metric": metric, "setting": reading,
              "changes": list(changes), **values}
             for metric, values in summary.items()
         ]  # fmt: skip

@@ -1,7 +1,7 @@
 """Trained on one map, tested on unseen ones; and how many trials it takes to learn.
 
-    python scripts/studies/study_transfer.py --study maps --network S4 --seeds 32
-    python scripts/studies/study_transfer.py --study trials --network S4 --seeds 32
+    python scripts/studies/study_transfer.py --study maps --model S4 --seeds 32
+    python scripts/studies/study_transfer.py --study trials --model S4 --seeds 32
 
 `maps`: robots learn for 20 trials on Scenario 1, 2 or 3 and drive, weights frozen, one trial on
 each of 100 random solvable maps that nothing was tuned on (`jaxsnn.maps.random_map`, a key of its
@@ -18,11 +18,11 @@ About 5 CPU-minutes each.
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, Literal
+from typing import Annotated, Any, Literal
 
 import tyro
+from tyro.conf import arg
 
-from snn_fusion_failure.commands.train_snn import learning_circles, seed_keys
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
@@ -42,8 +42,8 @@ class Transfer:
     """What to study."""
 
     study: Literal["maps", "trials"] = "maps"
-    network: Literal["S1", "S2", "S3", "S4"] = "S4"
-    setting: str = "tuned"
+    model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
+    reading: Annotated[str, arg(aliases=["--setting"])] = "tuned"
     scenarios: tuple[int, ...] = (1, 2, 3)
     """Maps to learn on."""
     seeds: int = 32
@@ -66,12 +66,14 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     import numpy as np
 
     from jaxsnn import agents, maps, planner, scenarios, trials
-    from jaxsnn.presets import network_setting
+    from jaxsnn.experiment import learning_circles, phase_keys, run_experiment, seed_keys
+    from jaxsnn.presets import preset
+    from jaxsnn.status import Status
 
-    built, constants = network_setting(config.network, config.setting)
-    place = scenarios.scenario(scenario)
+    built, constants = preset(config.model, config.reading)
+    map = scenarios.scenario(scenario)
     root = jax.random.key(MAP_KEY)
-    unseen = [maps.random_map(jax.random.fold_in(root, i)) for i in range(config.maps)]
+    unseen = [maps.random_map(key=jax.random.fold_in(root, i)) for i in range(config.maps)]
     stacked = maps.stack_maps(unseen)
     keys = seed_keys(jnp.arange(config.seeds))
     params = jax.tree.map(jnp.float32, agents.snn_params(built, constants))
@@ -79,30 +81,31 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
 
     @jax.jit
     def learn(keys: Any, params: Any) -> Any:
-        return trials.run_experiment(
-            built, params, place, keys, n_learn=20, n_test=1, max_steps=config.max_steps,
+        return run_experiment(
+            built, params, map, keys=keys, n_learn=20, n_test=1, max_steps=config.max_steps,
             block=config.block, circles=learning_circles(scenario, 20), keep_states=True,
         ).states  # fmt: skip
 
     def test_keys(keys: Any, i: Any) -> Any:
-        return jax.vmap(lambda k: jax.random.fold_in(trials.phase_keys(k)[2], i))(keys)
+        return jax.vmap(lambda k: jax.random.fold_in(phase_keys(k)[2], i))(keys)
 
     @jax.jit
     def test(states: Any, keys: Any, params: Any, stacked: Any) -> Any:
         def one(xs: Any) -> Any:
             i, here = xs
             _, result = trials.run_phase(
-                frozen, params, here, states, test_keys(keys, i),
+                frozen, params, here, states, keys=test_keys(keys, i),
                 n_trials=1, max_steps=config.max_steps,
             )  # fmt: skip
-            starts = jax.vmap(lambda k: trials.start_states(k, here, 1))(test_keys(keys, i))
+            begin = lambda k: trials.start_states(here, key=k, n_trials=1)  # noqa: E731
+            starts = jax.vmap(begin)(test_keys(keys, i))
             return result.status[:, 0], result.path[:, 0], starts.x[:, 0], starts.y[:, 0]
 
         return jax.lax.map(one, (jnp.arange(config.maps), stacked))
 
     states = learn(keys, params)
     status, path, x, y = (np.asarray(v) for v in test(states, keys, params, stacked))
-    arrived = status == trials.ARRIVED
+    arrived = status == Status.ARRIVED
     ratio = np.full(path.shape, np.nan)
     for i, here in enumerate(unseen):
         ok = arrived[i]
@@ -114,7 +117,7 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     return {
         "sr_unseen": (100.0 * arrived.mean(axis=0)).tolist(),
         "sr_unseen_by_map": (100.0 * arrived.mean(axis=1)).tolist(),
-        "collided_unseen": (100.0 * (status == trials.COLLIDED).mean(axis=0)).tolist(),
+        "collided_unseen": (100.0 * (status == Status.COLLIDED).mean(axis=0)).tolist(),
         "path_ratio": ratios,
     }
 
@@ -125,11 +128,13 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
     import jax.numpy as jnp
     import numpy as np
 
-    from jaxsnn import agents, scenarios, trials
-    from jaxsnn.presets import network_setting
+    from jaxsnn import agents, scenarios
+    from jaxsnn.experiment import learning_circles, run_experiment, seed_keys
+    from jaxsnn.presets import preset
+    from jaxsnn.status import Status
 
-    built, constants = network_setting(config.network, config.setting)
-    place = scenarios.scenario(scenario)
+    built, constants = preset(config.model, config.reading)
+    map = scenarios.scenario(scenario)
     params = jax.tree.map(jnp.float32, agents.snn_params(built, constants))
     keys = seed_keys(jnp.arange(config.seeds))
     values: dict[str, list[float]] = {}
@@ -137,13 +142,13 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
     for n in config.checkpoints:
         # Trial i depends on the key and i alone: every run repeats the shorter ones.
         run = jax.jit(
-            lambda keys, params, n=n: trials.run_experiment(
-                built, params, place, keys, n_learn=n, n_test=config.test_trials,
+            lambda keys, params, n=n: run_experiment(
+                built, params, map, keys=keys, n_learn=n, n_test=config.test_trials,
                 max_steps=config.max_steps, block=config.block,
                 circles=learning_circles(scenario, n),
             ).testing.status
         )  # fmt: skip
-        column = (np.asarray(run(keys, params)) == trials.ARRIVED).mean(axis=1)
+        column = (np.asarray(run(keys, params)) == Status.ARRIVED).mean(axis=1)
         columns.append(column)
         values[f"sr_testing_after_{n}"] = (100.0 * column).tolist()
     if config.checkpoints != CHECKPOINTS:
@@ -168,9 +173,11 @@ def shown_metric(config: Transfer) -> str:
 def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
     """Run the study on every scenario; returns the values by scenario."""
     if config.seeds < 1 or config.maps < 1:
-        raise ValueError(f"seeds = {config.seeds}, maps = {config.maps}: expected at least 1")
+        raise ValueError(f"seeds={config.seeds}, maps={config.maps}: expected at least 1; raise it")
     if not config.checkpoints or list(config.checkpoints) != sorted({*config.checkpoints} - {0}):
-        raise ValueError(f"checkpoints = {config.checkpoints}: expected rising numbers from 1 on")
+        raise ValueError(
+            f"checkpoints={config.checkpoints}: expected rising numbers from 1 on; reorder them"
+        )
     enable_compilation_cache()
     run = study_maps if config.study == "maps" else study_trials
     found: dict[Any, Any] = {}
@@ -184,9 +191,9 @@ def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
             bar.update(task, advance=1, status=f"Scenario {scenario}: {mean:.0f} %")
             if not config.record:
                 continue
-            model: str = config.network
-            if config.setting != "tuned":
-                model += f" {config.setting}"
+            model: str = config.model
+            if config.reading != "tuned":
+                model += f" {config.reading}"
             rows = [
                 {"row": f"trained on Scenario {scenario}", "model": model, "metric": metric,
                  "unit": UNITS.get(metric, "%"), **summarize(v)}

@@ -45,8 +45,8 @@ def spiking_robots(config: Config) -> dict[str, Any]:
     from snn_fusion_failure.commands import train_snn
 
     found = train_snn.main(
-        train_snn.TrainSnn(
-            scenario=1, network="S4", preset="quick", out=config.out / "robots_S4", overwrite=True
+        train_snn.Config(
+            scenario=1, model="S4", preset="quick", out=config.out / "robots_S4", overwrite=True
         )
     )
     means = {name: value["mean"] for name, value in found["metrics"].items()}

@@ -101,8 +101,8 @@ def _learn(plan: Plan, table: str, network: str) -> dict[str, Any] | None:
     if plan.collect_only and not (out or default).exists():
         return None
     name: Any = network
-    snn = train_snn.TrainSnn(
-        scenario=scenario, network=name, preset=preset, seeds=seeds, out=out, resume=True
+    snn = train_snn.Config(
+        scenario=scenario, model=name, preset=preset, seeds=seeds, out=out, resume=True
     )
     metrics: dict[str, Any] = train_snn.main(snn)["metrics"]
     return metrics

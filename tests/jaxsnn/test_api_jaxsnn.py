@@ -13,6 +13,7 @@ from jaxsnn import (
     agents,
     config,
     encoding,
+    experiment,
     geometry,
     navigation,
     network,
@@ -23,7 +24,7 @@ from jaxsnn import (
     rewards,
     running_mean,
     scenarios,
-    trials,
+    sensor_intervals,
     window,
     world,
 )
@@ -99,16 +100,16 @@ def pose(rng: np.random.Generator) -> tuple:
     return f32(rng.uniform(60, 120), rng.uniform(60, 120), rng.uniform(-3, 3))
 
 
-def robot(x: Any, y: Any, heading: Any) -> world.State:
-    return world.State(x, y, heading, jnp.zeros((), jnp.int32), jax.random.key(0))
+def robot(x: Any, y: Any, heading: Any) -> world.WorldState:
+    return world.WorldState(x, y, heading, jnp.zeros((), jnp.int32), jax.random.key(0))
 
 
 def crowd(rng: np.random.Generator) -> tuple:
     return f32(*rng.uniform(60, 300, (2, 3)), rng.uniform(-3, 3, 3), rng.uniform(-40, 40, 3))
 
 
-def robots(x: Any, y: Any, heading: Any) -> world.State:
-    return world.State(
+def robots(x: Any, y: Any, heading: Any) -> world.WorldState:
+    return world.WorldState(
         x, y, heading, jnp.zeros(3, jnp.int32), jax.random.split(jax.random.key(0), 3)
     )
 
@@ -127,8 +128,8 @@ def held(rng: np.random.Generator) -> network.Eligibility:
 
 def travel(x: Any, y: Any, heading: Any, steering: Any) -> jax.Array:
     before = robot(x, y, heading)
-    after, outcome = world.step(before, steering, PLACE)
-    return navigation.navigation_reward(before, after, outcome, PLACE)
+    after, outcome = world.step(PLACE, before, steering)
+    return navigation.navigation_reward(PLACE, before, after, outcome)
 
 
 CASES = [
@@ -178,12 +179,19 @@ CASES = [
         lambda p, s, pre, post: window.stdp_steps(p, s, pre, post, dt=DT),
         stdp,
     ),
-    Case(
-        "encoding.angle_region",
-        encoding.angle_region,
-        lambda rng: f32(rng.uniform(-180, 180, 4)),
-        (),
-        "gives integers",
+    *(
+        Case(
+            f"sensor_intervals.{name}",
+            getattr(sensor_intervals, name),
+            lambda rng, low=low, high=high: f32(rng.uniform(low, high, 4)),
+            (),
+            "gives integers",
+        )
+        for name, low, high in (
+            ("sonar_interval", 0, 300),
+            ("distance_interval", 0, 800),
+            ("angle_region", -180, 180),
+        )
     ),
     Case(
         "encoding.group_rates",
@@ -192,7 +200,7 @@ CASES = [
     ),
     Case(
         "encoding.poisson_spikes",
-        lambda k, rates: encoding.poisson_spikes(k, rates, 6, dt=DT),
+        lambda k, rates: encoding.poisson_spikes(rates, 6, key=k, dt=DT),
         lambda rng: (key(rng), *f32(rng.uniform(0, 500, 3))),
         (),
         SPIKES,
@@ -211,8 +219,8 @@ CASES = [
         (0, 2),
     ),
     Case(
-        "rewards.tempered",
-        rewards.tempered,
+        "rewards.scale_by_remaining_turn",
+        rewards.scale_by_remaining_turn,
         lambda rng: (sight(rng)[0], *f32(rng.normal(size=2), rng.uniform(-50, 50))),
         (0, 1, 2),
     ),
@@ -274,28 +282,28 @@ CASES = [
     ),
     Case(
         "world.obstacles_at",
-        lambda t: world.obstacles_at(t, PLACE),
+        lambda t: world.obstacles_at(PLACE, t),
         lambda rng: (np.int32(rng.integers(9)),),
         (),
         "of whole steps",
     ),
-    Case("world.reset", lambda k: world.reset(k, PLACE), lambda rng: (key(rng),), (), "a draw"),
-    Case("world.observe", lambda x, y, h: world.observe(robot(x, y, h), PLACE), pose, (0, 1, 2)),
+    Case("world.reset", lambda k: world.reset(PLACE, key=k), lambda rng: (key(rng),), (), "a draw"),
+    Case("world.observe", lambda x, y, h: world.observe(PLACE, robot(x, y, h)), pose, (0, 1, 2)),
     Case(
         "world.step",
-        lambda x, y, h, a: world.step(robot(x, y, h), a, PLACE)[0][:3],
+        lambda x, y, h, a: world.step(PLACE, robot(x, y, h), a)[0][:3],
         lambda rng: (*pose(rng), *f32(rng.uniform(-40, 40))),
         (0, 1, 2, 3),
     ),
     Case(
         "world.observe_many",
-        lambda x, y, h, a: world.observe_many(robots(x, y, h), PLACE, active=a > -20.0),
+        lambda x, y, h, a: world.observe_many(PLACE, robots(x, y, h), active=a > -20.0),
         crowd,
         (0, 1, 2),
     ),
     Case(
         "world.step_many",
-        lambda x, y, h, a: world.step_many(robots(x, y, h), a, PLACE, active=a > -20.0)[0][:3],
+        lambda x, y, h, a: world.step_many(PLACE, robots(x, y, h), a, active=a > -20.0)[0][:3],
         crowd,
         (0, 1, 2, 3),
     ),
@@ -336,8 +344,8 @@ CASES = [
         (0,),
     ),
     Case(
-        "network.settle",
-        lambda s, fresh: network.settle(CONSTANTS, s, fresh),
+        "network.reset_membranes",
+        lambda s, fresh: network.reset_membranes(CONSTANTS, s, fresh),
         lambda rng: (brain(rng), np.bool_(rng.random() < 0.5)),
     ),
     Case(
@@ -348,7 +356,7 @@ CASES = [
     ),
     Case(
         "qlearning.discretize",
-        lambda x, y, h: qlearning.discretize(world.observe(robot(x, y, h), PLACE)),
+        lambda x, y, h: qlearning.discretize(world.observe(PLACE, robot(x, y, h))),
         pose,
         (),
         "gives integers",
@@ -357,7 +365,7 @@ CASES = [
         "qlearning.td_target",
         qlearning.td_target,
         lambda rng: (
-            leaves(qlearning.default_params()),
+            leaves(qlearning.QParams()),
             *f32(rng.normal()),
             np.bool_(False),
             *f32(rng.normal(size=3)),
@@ -366,9 +374,29 @@ CASES = [
     ),
     Case(
         "navigation.observation",
-        lambda x, y, h: navigation.observation(world.observe(robot(x, y, h), PLACE), PLACE),
+        lambda x, y, h: navigation.observation(PLACE, world.observe(PLACE, robot(x, y, h))),
         pose,
         (0, 1, 2),
+    ),
+    Case(
+        "navigation.start_robot",
+        lambda k: navigation.start_robot(PLACE, key=k),
+        lambda rng: (key(rng),),
+        (),
+        "a draw",
+    ),
+    Case(
+        "navigation.drive_robot",
+        lambda x, y, h, a: navigation.drive_robot(PLACE, robot(x, y, h), a)[1:3],
+        lambda rng: (*pose(rng), *f32(rng.uniform(-0.9, 0.9, 1))),
+        (0, 1, 2, 3),
+    ),
+    Case(
+        "experiment.seed_keys",
+        experiment.seed_keys,
+        lambda rng: (np.int32(rng.integers(100, size=3)),),
+        (),
+        "makes keys",
     ),
     Case(
         "navigation.navigation_reward",
@@ -382,7 +410,9 @@ CASES = [
         lambda rng: (*f32(*rng.normal(size=(3, 5))), rng.random(5) < 0.2),
         (0, 1, 2),
     ),
-    Case("trials.phase_keys", trials.phase_keys, lambda rng: (key(rng),), (), "splits a key"),
+    Case(
+        "experiment.phase_keys", experiment.phase_keys, lambda rng: (key(rng),), (), "splits a key"
+    ),
 ]
 
 

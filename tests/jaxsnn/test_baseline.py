@@ -49,7 +49,7 @@ def test_neurons_that_always_fire_alike_stop_learning_and_others_learn_by_covari
     """Group 0 alternates between 0 and 100 Hz, group 1 fires at 50 Hz, all along."""
     stdp = STDPParams(anti_causal=0.0)
     params = network_params(
-        SMALL, stdp=stdp, gamma=0.0, centring=1.0, tau_usual=4.0, gain_input=4.0, gain_output=4.0
+        SMALL, stdp=stdp, gamma=0.0, centring=1.0, tau_baseline=4.0, gain_input=4.0, gain_output=4.0
     )
     state = network.init(jax.random.key(0), SMALL, params)
     state = state._replace(weights=jax.tree.map(lambda w: 0.5 * w + 1.0, state.weights))
@@ -57,7 +57,9 @@ def test_neurons_that_always_fire_alike_stop_learning_and_others_learn_by_covari
     rates = jnp.full((n, SMALL.n_in), 50.0)
     rates = rates.at[:, :8].set(jnp.where(jnp.arange(n)[:, None] // 10 % 2 == 0, 100.0, 0.0))
     keys = jax.random.split(jax.random.key(1), n)
-    pre = jax.vmap(lambda k, r: poisson_spikes(k, r, SMALL.hold_steps, dt=SMALL.dt))(keys, rates)
+    pre = jax.vmap(lambda k, r: poisson_spikes(r, SMALL.hold_steps, key=k, dt=SMALL.dt))(
+        keys, rates
+    )
     # Past the first half, and past the traces of what was before the last change.
     settled = (np.arange(n) >= 200) & (np.arange(n) % 10 >= 5)
     high, low = (settled & (np.arange(n) // 10 % 2 == k) for k in (0, 1))
@@ -81,13 +83,13 @@ def test_neurons_that_always_fire_alike_stop_learning_and_others_learn_by_covari
 def test_step_and_window_agree_with_a_settled_baseline():
     """A baseline that hardly moves within the run: then both forms see the same mean."""
     params = network_params(
-        SMALL, gamma=0.0, centring=1.0, tau_usual=1e6, gain_input=4.0, gain_output=4.0
+        SMALL, gamma=0.0, centring=1.0, tau_baseline=1e6, gain_input=4.0, gain_output=4.0
     )
     state = network.init(jax.random.key(0), SMALL, params)
     usual = Baseline(jnp.full((SMALL.n_in,), 0.05), jnp.asarray(1e6))
     hidden = Baseline(jnp.full((SMALL.n_hidden,), 0.03), jnp.asarray(1e6))
-    state = state._replace(usual_input=usual, usual_hidden=hidden)
-    pre = poisson_spikes(jax.random.key(2), jnp.full(SMALL.n_in, 80.0), 100, dt=SMALL.dt)
+    state = state._replace(baseline_input=usual, baseline_hidden=hidden)
+    pre = poisson_spikes(jnp.full(SMALL.n_in, 80.0), 100, key=jax.random.key(2), dt=SMALL.dt)
 
     @jax.jit
     def both(state, pre):

@@ -61,7 +61,7 @@ def test_env_agrees_with_the_world_and_with_our_own_env(env: Any) -> None:
     ours, theirs = own.step(state, action), env.step(raw, action)
     np.testing.assert_allclose(theirs.obs, ours.obs, rtol=1e-6)
     np.testing.assert_allclose(theirs.reward, ours.reward, rtol=1e-6)
-    moved, _ = world.step(world.reset(key, params), 22.5, params)
+    moved, _ = world.step(params, world.reset(params, key=key), 22.5)
     np.testing.assert_allclose(theirs.pipeline_state.robot.x, moved.x, rtol=1e-6)
 
 

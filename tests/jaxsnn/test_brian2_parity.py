@@ -61,7 +61,8 @@ def test_brian2_parity(recipe, golden, rule, dtype):
     data = np.load(golden / "snn_brian2.npz")
     want = {k.removeprefix(f"{rule}_"): data[k] for k in data if k.startswith(rule)}
     with jax.enable_x64(dtype == "float64"):
-        state, (spikes, v_hidden, v_output) = run(recipe, data, rule, dtype)
+        out = jax.tree.map(np.asarray, run(recipe, data, rule, dtype))
+    state, (spikes, v_hidden, v_output) = out
     assert want["spikes_hidden"].sum() > 100 and want["spikes_output"].sum() > 10
     np.testing.assert_array_equal(spikes.hidden > 0, want["spikes_hidden"])
     np.testing.assert_array_equal(spikes.output > 0, want["spikes_output"])

@@ -67,7 +67,7 @@ def test_angle_codes_permute_the_same_rates(code, order):
 
 def test_poisson_rate_variance_and_independence():
     rates = jnp.array([0.0, 25.0, 100.0, 400.0, 1000.0])
-    spikes = np.asarray(poisson_spikes(jax.random.key(0), rates, 40000, dt=1e-3))
+    spikes = np.asarray(poisson_spikes(rates, 40000, key=jax.random.key(0), dt=1e-3))
     assert set(np.unique(spikes)) <= {0.0, 1.0}
     p = np.asarray(rates) * 1e-3
     sd = np.sqrt(p * (1 - p) / len(spikes))
@@ -80,16 +80,16 @@ def test_poisson_rate_variance_and_independence():
 
 def test_spikes_depend_on_the_key_only():
     rates = jnp.full(7, 200.0)
-    a, b, c = (poisson_spikes(jax.random.key(k), rates, 50, dt=1e-3) for k in (1, 1, 2))
+    a, b, c = (poisson_spikes(rates, 50, key=jax.random.key(k), dt=1e-3) for k in (1, 1, 2))
     assert (a == b).all() and (a != c).any()
 
 
 @pytest.mark.parametrize(
     ("call", "part"),
     [
-        (lambda: check_rates(jnp.array([jnp.nan]), dt=1e-3), "firing rate = nan"),
-        (lambda: check_rates(jnp.array([-1.0]), dt=1e-3), "firing rate = -1"),
-        (lambda: check_rates(jnp.array([2000.0]), dt=1e-3), "above one spike per step"),
+        (lambda: check_rates(jnp.array([jnp.nan]), dt=1e-3), "rates=nan"),
+        (lambda: check_rates(jnp.array([-1.0]), dt=1e-3), "rates=-1"),
+        (lambda: check_rates(jnp.array([2000.0]), dt=1e-3), "at most one spike per step"),
     ],
 )
 def test_bad_rates_are_named(call, part):

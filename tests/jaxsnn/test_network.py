@@ -59,7 +59,9 @@ def runs():
 
 def inputs(config, n_windows, rate=60.0, seed=0):
     rates = jnp.full(config.n_in, rate)
-    pre = poisson_spikes(jax.random.key(seed), rates, n_windows * config.hold_steps, dt=config.dt)
+    pre = poisson_spikes(
+        rates, n_windows * config.hold_steps, key=jax.random.key(seed), dt=config.dt
+    )
     return pre.reshape(n_windows, config.hold_steps, config.n_in)
 
 
@@ -127,7 +129,7 @@ def test_window_agrees_at_full_size_over_a_second():
     params = network_params(config, gamma=0.0)
     state = network.init(jax.random.key(0), config, params)
     rates = jnp.repeat(jnp.array([50.0, 100.0, 50.0, 0.0, 50.0, 50.0, 25.0]), 30)
-    pre = poisson_spikes(jax.random.key(1), rates, 200, dt=config.dt)
+    pre = poisson_spikes(rates, 200, key=jax.random.key(1), dt=config.dt)
 
     @jax.jit
     def both(state, pre):
@@ -240,38 +242,38 @@ def test_settle_touches_membranes_of_fresh_robots_only():
     params = params_of(SMALL)
     state = network.init(jax.random.key(0), SMALL, params)
     state, _ = network.fire(SMALL, params, state, inputs(SMALL, 1)[0])
-    same = network.settle(params, state, jnp.asarray(False))
+    same = network.reset_membranes(params, state, jnp.asarray(False))
     jax.tree.map(np.testing.assert_array_equal, same, state)
-    rest = network.settle(params, state, jnp.asarray(True))
+    rest = network.reset_membranes(params, state, jnp.asarray(True))
     assert not rest.hidden.v.any() and not rest.output.v.any() and state.hidden.v.any()
 
 
 @pytest.mark.parametrize(
     ("call", "part"),
     [
-        (lambda: NetworkConfig(hidden_exc=7), "hidden_exc = 7: expected an even number"),
-        (lambda: NetworkConfig(hidden_exc=0, hidden_inh=0), "needs neurons"),
-        (lambda: NetworkConfig(control_steps=50, hold_steps=20), "does not divide"),
-        (lambda: NetworkConfig(dt=-1.0), "dt = -1.0"),
-        (lambda: network_config("S5"), "network = 'S5'"),
-        (lambda: check_network(SMALL, network_params(SMALL, gamma=-1.0)), "gamma = -1.0"),
+        (lambda: NetworkConfig(hidden_exc=7), "hidden_exc=7: expected an even number"),
+        (lambda: NetworkConfig(hidden_exc=0, hidden_inh=0), "expected a hidden neuron"),
+        (lambda: NetworkConfig(control_steps=50, hold_steps=20), "hold_steps=20: expected a"),
+        (lambda: NetworkConfig(dt=-1.0), "dt=-1.0"),
+        (lambda: network_config("S5"), "model='S5'"),
+        (lambda: check_network(SMALL, network_params(SMALL, gamma=-1.0)), "gamma=-1.0"),
         (
             lambda: check_network(SMALL, network_params(SMALL, hidden=LIFParams(tau_m=0.0))),
-            "tau_m = 0.0",
+            "tau_m=0.0",
         ),
         (
             lambda: network.init(
                 jax.random.key(0), SMALL, network_params(SMALL),
                 Weights(jnp.full((56, 24), 9.0), jnp.ones((2, 12))),
             ),
-            "weights.hidden holds 9 mV",
+            "weights.hidden=9: expected mV",
         ),
         (
             lambda: network.init(
                 jax.random.key(0), SMALL, network_params(SMALL),
                 Weights(jnp.ones((5, 24)), jnp.ones((2, 12))),
             ),
-            "has shape",
+            "weights.hidden=<shape",
         ),
     ],
 )  # fmt: skip

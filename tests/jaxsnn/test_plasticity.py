@@ -147,7 +147,7 @@ def test_closed_forms_solve_the_rules(rule, bounds, slope, drive):
         (lambda: check_stdp(STDPParams(tau_z=-1.0), dt=DT), ["tau_z", "-1.0"]),
         (lambda: check_stdp(STDPParams(a_plus=float("inf")), dt=DT), ["a_plus", "finite"]),
         (lambda: check_bounds(jnp.array([1.0, 7.0]), 0.0, 5.0), ["7", "[0, 5]", "clip"]),
-        (lambda: check_bounds(jnp.array([jnp.nan]), 0.0, 5.0), ["not finite"]),
+        (lambda: check_bounds(jnp.array([jnp.nan]), 0.0, 5.0), ["weights=nan", "expected finite"]),
     ],
 )
 def test_bad_input_is_named(call, names):

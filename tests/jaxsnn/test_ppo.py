@@ -61,17 +61,16 @@ def _hit_the_mark(discount_steps: int) -> ppo.Env:
 
 @pytest.mark.relaxed  # optax mixes int and float in the bias correction of Adam
 def test_it_finds_the_known_best_action_and_value() -> None:
-    config = ppo.Config(
-        n_envs=16, n_steps=16, n_updates=80, learning_rate=5e-3, discount=0.5, hidden=(32,)
-    )
+    config = ppo.PPOConfig(n_envs=16, n_steps=16, n_updates=80, hidden=(32,))
+    params = ppo.PPOParams(learning_rate=5e-3, discount=0.5)
     env = _hit_the_mark(2)
-    result = jax.jit(ppo.make_train(config, env))(jax.random.key(0))
+    result = jax.jit(ppo.make_train(config, env))(params, key=jax.random.key(0))
     obs = jnp.linspace(-0.9, 0.9, 7)[:, None]
-    action = jax.vmap(lambda o: ppo.act(config, env, result.params, o))(obs)
+    action = jax.vmap(lambda o: ppo.act(config, env, result.weights, o))(obs)
     np.testing.assert_allclose(action, obs, atol=0.15)
     # The observation does not tell the two steps of an episode apart: the value that fits both is
     # the mean of (1 + 0.5) and 1 times the reward, less the exploration that is left.
-    value = jax.vmap(lambda o: ppo._network(config, env).apply(result.params, o)[2])(obs)
+    value = jax.vmap(lambda o: ppo._network(config, env).apply(result.weights, o)[2])(obs)
     reward = float(result.metrics.reward[-10:].mean())
     assert reward > 0.85
     np.testing.assert_allclose(value.mean(), 1.25 * reward, atol=0.1)
@@ -82,14 +81,16 @@ def test_it_finds_the_known_best_action_and_value() -> None:
 
 @pytest.mark.relaxed  # optax, as above
 def test_robots_learn_to_arrive_in_scenario_1() -> None:
-    config = ppo.Config(n_envs=8, n_steps=64, n_updates=40)
+    config = ppo.PPOConfig(n_envs=8, n_steps=64, n_updates=40)
     env = navigation.navigation_env(scenarios.scenario(1), max_steps=100)
 
     @jax.jit
     def run(key: jax.Array) -> tuple[ppo.Rollout, jax.Array, jax.Array]:
-        result = ppo.make_train(config, env)(key)
+        result = ppo.make_train(config, env)(ppo.PPOParams(), key=key)
         keys = jax.random.split(jax.random.key(9), 50)
-        state, success, terminated = ppo.evaluate(config, env, result.params, keys, max_steps=100)
+        state, success, terminated = ppo.evaluate(
+            config, env, result.weights, keys=keys, max_steps=100
+        )
         return result.metrics, success & terminated, state.length
 
     metrics, success, length = run(jax.random.key(0))
@@ -101,11 +102,11 @@ def test_robots_learn_to_arrive_in_scenario_1() -> None:
 
 
 def test_sizes_that_do_not_fit_are_refused() -> None:
-    with pytest.raises(ValueError, match="12 transitions do not split into n_minibatches = 5"):
-        ppo.Config(n_envs=3, n_steps=4, n_minibatches=5)
-    with pytest.raises(ValueError, match="n_envs = 0"):
-        ppo.Config(n_envs=0)
-    with pytest.raises(ValueError, match="learning_rate = -1"):
-        ppo.Config(learning_rate=-1.0)
-    with pytest.raises(ValueError, match="max_steps = 0"):
+    with pytest.raises(ValueError, match="n_minibatches=5: expected a divisor of n_envs"):
+        ppo.PPOConfig(n_envs=3, n_steps=4, n_minibatches=5)
+    with pytest.raises(ValueError, match="n_envs=0"):
+        ppo.PPOConfig(n_envs=0)
+    with pytest.raises(ValueError, match="learning_rate=-1"):
+        ppo.check_ppo(ppo.PPOParams(learning_rate=-1.0))
+    with pytest.raises(ValueError, match="max_steps=0"):
         navigation.navigation_env(scenarios.scenario(1), max_steps=0)

@@ -52,38 +52,38 @@ def test_behind_is_one_region_on_both_sides() -> None:
 
 
 def test_target_of_the_update_in_closed_form() -> None:
-    q = qlearning.default_params(discount=0.5)
+    q = qlearning.QParams(discount=0.5)
     ahead = jnp.asarray([1.0, 4.0, -2.0])
     assert qlearning.td_target(q, jnp.float32(2.0), jnp.asarray(False), ahead) == 4.0
     assert qlearning.td_target(q, jnp.float32(2.0), jnp.asarray(True), ahead) == 2.0
 
 
 @pytest.fixture(scope="module")
-def lane() -> world.Params:
+def lane() -> world.WorldParams:
     """An open room: facing the target within 45 degrees, driving straight mostly misses."""
     return maps.make_map(target=(300, 300), starts=[(100, 300, 20)])
 
 
 @pytest.fixture(scope="module")
-def learned(lane: world.Params) -> Any:
+def learned(lane: world.WorldParams) -> Any:
     keys = jax.random.split(jax.random.key(0), N)
-    q = qlearning.default_params()
+    q = jax.tree.map(jnp.float32, qlearning.QParams())
     return q, keys, run(
-        keys, qlearning.init(N), q, lane, n_trials=TRIALS, max_steps=STEPS, learn=True
+        q, lane, qlearning.init(N), keys=keys, n_trials=TRIALS, max_steps=STEPS, learn=True
     )  # fmt: skip
 
 
-def test_it_learns_to_arrive(lane: world.Params, learned: Any) -> None:
+def test_it_learns_to_arrive(lane: world.WorldParams, learned: Any) -> None:
     q, _, (tables, trials) = learned
     greedy = q._replace(epsilon=jnp.float32(0.0))
     keys = jax.random.split(jax.random.key(1), N)
     # Same sizes as in training: one compiled program serves tests with and without learning.
     _, before = run(
-        keys, qlearning.init(N), greedy._replace(learning_rate=jnp.float32(0.0)), lane,
+        greedy._replace(learning_rate=jnp.float32(0.0)), lane, qlearning.init(N), keys=keys,
         n_trials=TRIALS, max_steps=STEPS, learn=True,
     )  # fmt: skip
     _, after = run(
-        keys, tables, greedy._replace(learning_rate=jnp.float32(0.0)), lane,
+        greedy._replace(learning_rate=jnp.float32(0.0)), lane, tables, keys=keys,
         n_trials=TRIALS, max_steps=STEPS, learn=True,
     )  # fmt: skip
     # Untrained and greedy drives straight: it arrives when it happens to face the target.
@@ -92,7 +92,7 @@ def test_it_learns_to_arrive(lane: world.Params, learned: Any) -> None:
     assert trials.arrived[:, -20:].mean() > trials.arrived[:, :20].mean() + 0.1
 
 
-def test_trials_are_booked_once_each(lane: world.Params, learned: Any) -> None:
+def test_trials_are_booked_once_each(lane: world.WorldParams, learned: Any) -> None:
     tables, trials = jax.tree.map(np.asarray, learned[2])
     assert not (trials.arrived & trials.collided).any()
     assert (trials.steps >= 1).all()
@@ -109,30 +109,32 @@ def test_trials_are_booked_once_each(lane: world.Params, learned: Any) -> None:
 
 
 def test_learners_are_independent_of_their_batch_and_can_go_on(
-    lane: world.Params, learned: Any
+    lane: world.WorldParams, learned: Any
 ) -> None:
     q, keys, (tables, trials) = learned
     swapped, again = run(
-        keys[::-1], qlearning.init(N), q, lane, n_trials=TRIALS, max_steps=STEPS, learn=True
+        q, lane, qlearning.init(N), keys=keys[::-1], n_trials=TRIALS, max_steps=STEPS, learn=True
     )
     np.testing.assert_array_equal(again.steps[::-1], trials.steps)
     np.testing.assert_array_equal(swapped[::-1], tables)
     half = TRIALS // 2
-    first, a = run(keys, qlearning.init(N), q, lane, n_trials=half, max_steps=STEPS, learn=True)
+    first, a = run(
+        q, lane, qlearning.init(N), keys=keys, n_trials=half, max_steps=STEPS, learn=True
+    )
     second, b = run(
-        keys, first, q, lane, n_trials=half, max_steps=STEPS, learn=True, first_trial=half
+        q, lane, first, keys=keys, n_trials=half, max_steps=STEPS, learn=True, first_trial=half
     )
     np.testing.assert_array_equal(np.concatenate([a.steps, b.steps], axis=1), trials.steps)
     np.testing.assert_allclose(second, tables, atol=1e-6)
 
 
-def test_bad_constants_are_refused(lane: world.Params) -> None:
-    with pytest.raises(ValueError, match=r"epsilon = 1\.5"):
-        qlearning.default_params(epsilon=1.5)
-    with pytest.raises(ValueError, match="n = 0 learners"):
+def test_bad_constants_are_refused(lane: world.WorldParams) -> None:
+    with pytest.raises(ValueError, match=r"epsilon=1\.5"):
+        qlearning.check_q(qlearning.QParams(epsilon=1.5))
+    with pytest.raises(ValueError, match="n=0: expected"):
         qlearning.init(0)
-    with pytest.raises(ValueError, match="n_trials = 0"):
+    with pytest.raises(ValueError, match="n_trials=0"):
         qlearning.run_trials(
-            jax.random.split(jax.random.key(0), 1), qlearning.init(1), qlearning.default_params(),
-            lane, n_trials=0, max_steps=5, learn=True,
+            qlearning.QParams(), lane, qlearning.init(1),
+            keys=jax.random.split(jax.random.key(0), 1), n_trials=0, max_steps=5, learn=True,
         )  # fmt: skip

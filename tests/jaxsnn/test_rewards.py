@@ -92,36 +92,38 @@ def test_sign_table(first, second, want):
 
 @pytest.mark.parametrize(
     ("change", "part"),
-    [({"d_safe": 0.0}, "d_safe = 0"), ({"collision": float("nan")}, "collision")],
+    [({"d_safe": 0.0}, "d_safe=0"), ({"collision": float("nan")}, "collision")],
 )
 def test_bad_constants_are_named(change, part):
     with pytest.raises(ValueError, match=part):
         rewards.check_rewards(RewardParams(**change))
 
 
-def test_a_tempered_reward_ends_at_the_goal_and_turns_round_behind_it():
+def test_a_scaled_reward_ends_at_the_goal_and_turns_round_behind_it():
     params = RewardParams(goal_angle=50.0)
     left = jnp.array([-1.5, 1.5])
     factors = {-50.0: 1.0, 0.0: 1.0, 25.0: 0.5, 50.0: 0.0, 75.0: -0.5, 500.0: -1.0}
     for angle, factor in factors.items():
-        got = rewards.tempered(params, left, jnp.asarray(angle))
+        got = rewards.scale_by_remaining_turn(params, left, jnp.asarray(angle))
         np.testing.assert_allclose(got, factor * left, atol=1e-6)
-        mirrored = rewards.tempered(params, left[::-1], jnp.asarray(-angle))
+        mirrored = rewards.scale_by_remaining_turn(params, left[::-1], jnp.asarray(-angle))
         np.testing.assert_allclose(mirrored, got[::-1], atol=1e-6)
-    literal = rewards.tempered(RewardParams(), left, jnp.asarray(400.0))
+    literal = rewards.scale_by_remaining_turn(RewardParams(), left, jnp.asarray(400.0))
     np.testing.assert_array_equal(literal, left)
     both = jnp.array([-2.0, -2.0])
-    np.testing.assert_array_equal(rewards.tempered(params, both, jnp.asarray(80.0)), both)
+    np.testing.assert_array_equal(
+        rewards.scale_by_remaining_turn(params, both, jnp.asarray(80.0)), both
+    )
 
 
 def test_avoidance_first_silences_the_target_near_obstacles():
-    place = sonar((0, 50.0)), jnp.asarray(50.0), jnp.asarray(90.0)
-    with_target = rewards.motor_rewards(RewardParams(opponent=1.0), *place)
-    first = rewards.motor_rewards(RewardParams(opponent=1.0, target_near_obstacle=0.0), *place)
+    map = sonar((0, 50.0)), jnp.asarray(50.0), jnp.asarray(90.0)
+    with_target = rewards.motor_rewards(RewardParams(opponent=1.0), *map)
+    first = rewards.motor_rewards(RewardParams(opponent=1.0, target_near_obstacle=0.0), *map)
     np.testing.assert_allclose(first, [1.8, -1.8], rtol=1e-6)
     np.testing.assert_allclose(with_target - first, [-1.75, 1.75], rtol=1e-6)
 
 
 def test_a_goal_angle_must_be_positive():
-    with pytest.raises(ValueError, match="goal_angle = 0"):
+    with pytest.raises(ValueError, match="goal_angle=0"):
         rewards.check_rewards(RewardParams(goal_angle=0.0))

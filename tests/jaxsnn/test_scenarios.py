@@ -61,5 +61,5 @@ def test_maps_of_record_have_not_changed() -> None:
 
 
 def test_unknown_scenario_is_refused() -> None:
-    with pytest.raises(ValueError, match=r"scenario 4 does not exist; choose one of \[1, 2, 3\]"):
+    with pytest.raises(ValueError, match=r"number=4: expected one of \[1, 2, 3\]"):
         scenarios.scenario(4)

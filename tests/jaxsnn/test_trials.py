@@ -10,19 +10,10 @@ import pytest
 from jaxsnn import network, scenarios, world
 from jaxsnn.agents import Agent, snn_agent, snn_params, steering_angle
 from jaxsnn.config import NetworkConfig, network_params
+from jaxsnn.experiment import run_experiment
 from jaxsnn.plasticity import STDPParams
-from jaxsnn.trials import (
-    ARRIVED,
-    COLLIDED,
-    NON_FINITE,
-    NOT_RUN,
-    TIMEOUT,
-    run_experiment,
-    run_phase,
-    run_trial,
-    start_states,
-    success_rate,
-)
+from jaxsnn.status import Status
+from jaxsnn.trials import run_phase, run_trial, start_states, success_rate
 
 SMALL = NetworkConfig(
     hidden_exc=12, hidden_inh=12, group_exc=4, group_inh=4, control_steps=40, hold_steps=20
@@ -40,7 +31,7 @@ def keys(n, seed=0):
 def scripted(turn):
     """An agent that steers by a rule; its state counts how often it has acted and learnt."""
 
-    def act(params, state, reading, key, fresh, active):
+    def act(params, state, reading, fresh, active, *, key):
         steering = jnp.asarray(turn(params, reading), jnp.float32)
         return (
             state + jnp.array([1, 0]) * active.astype(jnp.int32),
@@ -63,7 +54,7 @@ def scripted(turn):
 
 @pytest.fixture(scope="module")
 def phase():
-    def run(params, place, states, keys, name, n_trials, max_steps, record):
+    def run(params, map, states, keys, name, n_trials, max_steps, record):
         turns = {
             "seek": lambda p, r: jnp.clip(r.angle, -30, 30),
             "straight": lambda p, r: 0.0,
@@ -71,7 +62,7 @@ def phase():
             "broken": lambda p, r: jnp.where(r.distance < 200, jnp.nan, jnp.clip(r.angle, -30, 30)),
         }
         return run_phase(
-            scripted(turns[name]), params, place, states, keys,
+            scripted(turns[name]), params, map, states, keys=keys,
             n_trials=n_trials, max_steps=max_steps, record=record,
         )  # fmt: skip
 
@@ -82,14 +73,14 @@ def test_statuses_steps_and_paths(phase):
     states = jnp.zeros((3, 2), jnp.int32)
     args = {"n_trials": 4, "max_steps": 60, "record": True}
     state, seek = phase(None, PLACE, states, keys(3), "seek", **args)
-    assert (seek.status == ARRIVED).all() and (success_rate(seek) == 1).all()
+    assert (seek.status == Status.ARRIVED).all() and (success_rate(seek) == 1).all()
     # Straight to the target: no more than the way there, no less than the way less the radius.
     assert (seek.steps >= 15).all() and (seek.steps <= 28).all()
     np.testing.assert_array_less(seek.path, 15.0 * np.asarray(seek.steps) + 1e-2)
     np.testing.assert_array_equal(state[:, 0], seek.steps.sum(1))  # acted while under way, only
     np.testing.assert_array_equal(state[:, 1], seek.steps.sum(1))
 
-    begin = jax.vmap(lambda k: start_states(k, PLACE, 4))(keys(3))
+    begin = jax.vmap(lambda k: start_states(PLACE, key=k, n_trials=4))(keys(3))
     np.testing.assert_allclose(begin.x, seek.poses[:, :, 0, 0], rtol=1e-6)
     np.testing.assert_allclose(begin.heading, seek.poses[:, :, 0, 2], rtol=1e-5, atol=1e-6)
     poses, steps = np.asarray(seek.poses), np.asarray(seek.steps)
@@ -103,11 +94,11 @@ def test_statuses_steps_and_paths(phase):
             assert gap <= float(PLACE.arrival_radius) + 1e-2
 
     _, circle = phase(None, PLACE, states, keys(3), "circle", **args)
-    assert (circle.status == TIMEOUT).all() and (circle.steps == 60).all()
+    assert (circle.status == Status.TIMEOUT).all() and (circle.steps == 60).all()
     np.testing.assert_allclose(circle.info[..., 0], 120.0)
     _, straight = phase(None, PLACE, states, keys(3), "straight", **args)
-    assert set(np.unique(straight.status)) <= {ARRIVED, COLLIDED}
-    assert (straight.status == COLLIDED).any()
+    assert set(np.unique(straight.status)) <= {Status.ARRIVED, Status.COLLIDED}
+    assert (straight.status == Status.COLLIDED).any()
 
 
 def test_results_do_not_depend_on_the_block(phase):
@@ -122,8 +113,8 @@ def test_a_broken_robot_stops_alone(phase):
     _, result = phase(
         None, PLACE, jnp.zeros((2, 2), jnp.int32), keys(2), "broken", 3, 60, record=False
     )
-    assert result.status[:, 0].tolist() == [NON_FINITE, NON_FINITE]
-    assert result.status[:, 1:].tolist() == [[NOT_RUN] * 2] * 2
+    assert result.status[:, 0].tolist() == [Status.NON_FINITE, Status.NON_FINITE]
+    assert result.status[:, 1:].tolist() == [[Status.NOT_RUN] * 2] * 2
     assert (result.steps[:, 1:] == 0).all()
 
 
@@ -131,7 +122,7 @@ def test_experiment_learns_then_freezes():
     @jax.jit
     def experiment(params, keys):
         return run_experiment(
-            SMALL, snn_params(SMALL, params), PLACE, keys, n_learn=2, n_test=2, n_online=1,
+            SMALL, snn_params(SMALL, params), PLACE, keys=keys, n_learn=2, n_test=2, n_online=1,
             max_steps=15, block=2, circles=jnp.array([1, 0]), record=True, keep_states=True,
         )  # fmt: skip
 
@@ -154,16 +145,21 @@ def test_nan_weights_stop_one_robot_only():
     states = jax.jit(jax.vmap(lambda k: learner.init(k, params)))(keys(2))
     spoilt = states.weights.hidden.at[0].set(jnp.nan)
     states = states._replace(weights=states.weights._replace(hidden=spoilt))
-    run = jax.jit(lambda s, k: run_phase(learner, params, PLACE, s, k, n_trials=2, max_steps=10)[1])
+    run = jax.jit(
+        lambda s, k: run_phase(learner, params, PLACE, s, keys=k, n_trials=2, max_steps=10)[1]
+    )
     result = run(states, keys(2))
-    assert result.status[0].tolist() == [NON_FINITE, NOT_RUN]
-    assert NON_FINITE not in result.status[1].tolist() and NOT_RUN not in result.status[1].tolist()
+    assert result.status[0].tolist() == [Status.NON_FINITE, Status.NOT_RUN]
+    assert (
+        Status.NON_FINITE not in result.status[1].tolist()
+        and Status.NOT_RUN not in result.status[1].tolist()
+    )
 
 
 def test_one_trial_of_one_robot():
     agent, params = snn_agent(SMALL, plastic=False), snn_params(SMALL, PARAMS)
     state = jax.jit(agent.init)(jax.random.key(0), params)
-    run = jax.jit(lambda s, k: run_trial(agent, params, PLACE, s, k, max_steps=10, record=True))
+    run = jax.jit(lambda s, k: run_trial(agent, params, PLACE, s, key=k, max_steps=10, record=True))
     after, result = run(state, jax.random.key(1))
     assert result.status.shape == () and result.poses.shape == (11, 3)
     jax.tree.map(np.testing.assert_array_equal, after.weights, state.weights)
@@ -173,9 +169,9 @@ def test_left_motor_turns_right():
     """Section 2.4.3: left when freq_l - freq_r is negative; our angles are positive to the left."""
     left_faster = steering_angle(PARAMS, jnp.array([30.0, 10.0]))
     assert float(left_faster) == -20.0
-    state = world.reset(jax.random.key(0), PLACE)
-    turned, _ = jax.jit(world.step)(state, left_faster, PLACE)
-    assert float(world.observe(turned, PLACE).angle) > float(world.observe(state, PLACE).angle)
+    state = world.reset(PLACE, key=jax.random.key(0))
+    turned, _ = jax.jit(world.step)(PLACE, state, left_faster)
+    assert float(world.observe(PLACE, turned).angle) > float(world.observe(PLACE, state).angle)
 
 
 def test_a_rewarded_reading_turns_the_robot_that_way():
@@ -193,7 +189,7 @@ def test_a_rewarded_reading_turns_the_robot_that_way():
         yes = jnp.asarray(True)
 
         def body(state, k):
-            state, steering, memory, _ = agent.act(params, state, reading, k, ~yes, yes)
+            state, steering, memory, _ = agent.act(params, state, reading, ~yes, yes, key=k)
             return agent.learn(params, state, memory, nothing, None, yes), steering
 
         return jax.lax.scan(body, agent.init(key, params), jax.random.split(key, 24))[1]
@@ -206,16 +202,16 @@ def test_a_rewarded_reading_turns_the_robot_that_way():
 @pytest.mark.parametrize(
     ("change", "part"),
     [
-        ({"n_trials": 0}, "n_trials = 0"),
-        ({"max_steps": 0}, "max_steps = 0"),
+        ({"n_trials": 0}, "n_trials=0"),
+        ({"max_steps": 0}, "max_steps=0"),
     ],
 )
 def test_bad_numbers_are_named(change, part):
     args = {"n_trials": 1, "max_steps": 5, **change}
     with pytest.raises(ValueError, match=part):
-        run_phase(scripted(lambda p, r: 0.0), None, PLACE, jnp.zeros((1, 2)), keys(1), **args)
-    with pytest.raises(ValueError, match="robots = 0"):
+        run_phase(scripted(lambda p, r: 0.0), None, PLACE, jnp.zeros((1, 2)), keys=keys(1), **args)
+    with pytest.raises(ValueError, match="expected one key per robot"):
         run_phase(
-            scripted(lambda p, r: 0.0), None, PLACE, jnp.zeros((0, 2)), keys(1)[:0],
+            scripted(lambda p, r: 0.0), None, PLACE, jnp.zeros((0, 2)), keys=keys(1)[:0],
             n_trials=1, max_steps=1,
         )  # fmt: skip

@@ -84,5 +84,5 @@ def test_gradient_with_respect_to_the_constants():
 
 
 def test_empty_window_is_refused():
-    with pytest.raises(ValueError, match="n_steps = 0"):
+    with pytest.raises(ValueError, match="n_steps=0"):
         stdp_kernel(PARAMS, 0, dt=DT)

@@ -21,19 +21,19 @@ N = 256
 reset = jax.jit(world.reset)
 observe = jax.jit(world.observe)
 step = jax.jit(world.step)
-reset_all = jax.jit(jax.vmap(world.reset, (0, None)))
-observe_all = jax.jit(jax.vmap(world.observe, (0, None)))
-step_all = jax.jit(jax.vmap(world.step, (0, 0, None)))
+reset_all = jax.jit(lambda keys, params: jax.vmap(lambda k: world.reset(params, key=k))(keys))
+observe_all = jax.jit(jax.vmap(world.observe, (None, 0)))
+step_all = jax.jit(jax.vmap(world.step, (None, 0, 0)))
 
 
-def shapes(params: world.Params) -> tuple[Any, Any, np.ndarray]:
+def shapes(params: world.WorldParams) -> tuple[Any, Any, np.ndarray]:
     """Polygons, polygons with the walls, and the circles, in float64."""
     still = planner.Obstacles.of(params)
     solid = shapely.union_all([shapely.Polygon(loop) for loop in still.loops()])
     return solid, shapely.union_all([solid, shapely.box(*still.bounds).exterior]), still.circles
 
 
-def gap_to_everything(lines: np.ndarray, params: world.Params) -> np.ndarray:
+def gap_to_everything(lines: np.ndarray, params: world.WorldParams) -> np.ndarray:
     """Distance of shapely lines to the nearest polygon, wall or circle."""
     _, everything, circles = shapes(params)
     gap = shapely.distance(lines, everything)
@@ -42,7 +42,7 @@ def gap_to_everything(lines: np.ndarray, params: world.Params) -> np.ndarray:
     return gap
 
 
-def ray_cast(xy: np.ndarray, angles: np.ndarray, params: world.Params) -> np.ndarray:
+def ray_cast(xy: np.ndarray, angles: np.ndarray, params: world.WorldParams) -> np.ndarray:
     """Sonars by shapely: polygons and walls cut the ray, a circle cuts it before its foot."""
     _, everything, circles = shapes(params)
     xy = np.broadcast_to(xy[:, None], (*angles.shape, 2))
@@ -66,14 +66,14 @@ def rollout(steps: int) -> Callable[..., Any]:
 
     @jax.jit
     @chex.assert_max_traces(n=1)
-    def run(key: jax.Array, params: world.Params) -> tuple[world.State, Any, Any]:
+    def run(key: jax.Array, params: world.WorldParams) -> tuple[world.WorldState, Any, Any]:
         k_reset, k_steer = jax.random.split(key)
-        first = jax.vmap(lambda k: world.reset(k, params))(jax.random.split(k_reset, N))
+        first = jax.vmap(lambda k: world.reset(params, key=k))(jax.random.split(k_reset, N))
         steering = 25.0 * jax.random.normal(k_steer, (steps, N))
 
-        def body(carry: tuple[world.State, jax.Array], theta: jax.Array) -> tuple[Any, Any]:
+        def body(carry: tuple[world.WorldState, jax.Array], theta: jax.Array) -> tuple[Any, Any]:
             states, over = carry
-            after, outcome = jax.vmap(lambda s, a: step(s, a, params))(states, theta)
+            after, outcome = jax.vmap(lambda s, a: step(params, s, a))(states, theta)
             after = jax.tree.map(lambda old, new: jnp.where(over, old, new), states, after)
             flags = world.Outcome(*(f & ~over for f in outcome))
             over = over | flags.collided | flags.arrived
@@ -85,10 +85,10 @@ def rollout(steps: int) -> Callable[..., Any]:
 
 
 @pytest.fixture(scope="module", params=[1, 2, 3, "random", "fast"])
-def case(request: pytest.FixtureRequest) -> tuple[world.Params, Any, Any, Any]:
+def case(request: pytest.FixtureRequest) -> tuple[world.WorldParams, Any, Any, Any]:
     """A map and a rollout on it; "fast" moves 400 px in a step, over whole obstacles."""
     if request.param == "random":
-        params = maps.random_map(jax.random.key(5))
+        params = maps.random_map(key=jax.random.key(5))
     elif request.param == "fast":
         params = scenarios.scenario(3)._replace(speed=jnp.float32(400.0))
     else:
@@ -106,11 +106,11 @@ def test_sonar_equals_shapely_ray_casting(case: tuple) -> None:
     )
     with jax.enable_x64(True):
         wide = jax.tree.map(
-            lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a, (states, params)
+            lambda a: a.astype(jnp.float64) if a.dtype == jnp.float32 else a, (params, states)
         )
         exact = observe_all(*wide)
         exact = jax.tree.map(np.asarray, exact)
-    single = observe_all(states, params)
+    single = observe_all(params, states)
 
     solid, _, circles = shapes(params)
     xy = np.stack([states.x, states.y], axis=1).astype(np.float64)
@@ -134,26 +134,26 @@ def test_sonar_equals_shapely_ray_casting(case: tuple) -> None:
 
 def test_distance_and_angle_in_a_known_pose() -> None:
     params = scenarios.scenario(1)
-    state = reset(jax.random.key(0), params)
+    state = reset(params, key=jax.random.key(0))
     state = state._replace(x=jnp.float32(400.0), y=jnp.float32(200.0), heading=jnp.float32(0.0))
-    reading = observe(state, params)
+    reading = observe(params, state)
     np.testing.assert_allclose(reading.distance, 100.0)
     np.testing.assert_allclose(reading.angle, 90.0)  # target straight above: to the left
-    away = observe(state._replace(heading=jnp.float32(-np.pi / 2)), params)
+    away = observe(params, state._replace(heading=jnp.float32(-np.pi / 2)))
     np.testing.assert_allclose(np.abs(away.angle), 180.0, rtol=1e-6)
 
 
 def test_angle_lies_in_the_half_open_interval(case: tuple) -> None:
     params, _, states, _ = case
     poses = jax.tree.map(lambda a: a[10], states)
-    reading = observe_all(poses, params)
+    reading = observe_all(params, poses)
     assert (reading.angle > -180.0).all()
     assert (reading.angle <= 180.0).all()
     assert (reading.sonar >= 0).all()
     assert (reading.sonar <= 300.0).all()
 
 
-def mirror(params: world.Params) -> world.Params:
+def mirror(params: world.WorldParams) -> world.WorldParams:
     """The map upside down."""
     height = params.bounds[1] + params.bounds[3]
 
@@ -174,14 +174,14 @@ def test_mirrored_world_gives_mirrored_readings(case: tuple) -> None:
     twins = first._replace(y=params.bounds[1] + params.bounds[3] - first.y, heading=-first.heading)
     steering = jnp.linspace(-90.0, 90.0, N)
     for _ in range(2):
-        here, there = observe_all(first, params), observe_all(twins, reflected)
+        here, there = observe_all(params, first), observe_all(reflected, twins)
         # 256 poses: a ray that grazes a corner in one world may miss it in the other.
         same = np.isclose(here.sonar, there.sonar[:, ::-1], atol=2e-2).mean()
         assert same > 0.995
         np.testing.assert_allclose(here.distance, there.distance, atol=1e-3)
         np.testing.assert_allclose(here.angle, -there.angle, atol=1e-2)
-        first, a = step_all(first, steering, params)
-        twins, b = step_all(twins, -steering, reflected)
+        first, a = step_all(params, first, steering)
+        twins, b = step_all(reflected, twins, -steering)
         np.testing.assert_array_equal(a.collided, b.collided)
         np.testing.assert_array_equal(a.arrived, b.arrived)
         np.testing.assert_allclose(first.x, twins.x, atol=5e-2)
@@ -211,11 +211,11 @@ def test_no_path_crosses_an_obstacle(case: tuple) -> None:
 def test_thin_obstacle_stops_a_robot_at_any_speed() -> None:
     wall = [(400.0, 50.0), (400.01, 50.0), (400.01, 550.0), (400.0, 550.0)]
     params = maps.make_map([wall], target=(700, 300), starts=[(100, 300, 0)], heading_spread=0.0)
-    state = reset(jax.random.key(0), params)
+    state = reset(params, key=jax.random.key(0))
     for speed in (15.0, 299.0, 600.0, 1e4):
         here, outcome = state, world.Outcome(jnp.zeros((), bool), jnp.zeros((), bool))
         while not (outcome.collided | outcome.arrived):
-            here, outcome = step(here, 0.0, params._replace(speed=jnp.float32(speed)))
+            here, outcome = step(params._replace(speed=jnp.float32(speed)), here, 0.0)
         assert outcome.collided
         np.testing.assert_allclose(here.x, 394.0, atol=1e-3)
 
@@ -229,16 +229,16 @@ def test_target_before_obstacle_is_an_arrival_and_behind_it_a_collision() -> Non
         speed=500.0,
     )
     for circle, arrives in ((0, False), (1, True)):
-        state = reset(jax.random.key(0), params, circle=circle)
-        _, outcome = step(state, 0.0, params)
+        state = reset(params, key=jax.random.key(0), circle=circle)
+        _, outcome = step(params, state, 0.0)
         assert bool(outcome.arrived) is arrives
         assert bool(outcome.collided) is not arrives
 
 
 def test_steering_is_positive_to_the_left_and_the_speed_is_15() -> None:
     params = scenarios.scenario(1)
-    state = reset(jax.random.key(3), params, circle=0)._replace(heading=jnp.float32(0.0))
-    after, _ = step(state, 90.0, params)
+    state = reset(params, key=jax.random.key(3), circle=0)._replace(heading=jnp.float32(0.0))
+    after, _ = step(params, state, 90.0)
     np.testing.assert_allclose(after.y - state.y, 15.0, rtol=1e-5)
     np.testing.assert_allclose(after.x, state.x, atol=1e-4)
     assert after.t == 1
@@ -254,7 +254,7 @@ def test_starts_fill_the_circles_and_face_the_target() -> None:
     assert abs(left.mean() - 0.5) < 0.04  # five standard errors
     # Uniform in area: half of the starts lie within R / sqrt(2).
     assert abs((gaps.min(axis=1) < 40.0 / np.sqrt(2)).mean() - 0.5) < 0.04
-    reading = observe_all(states, params)
+    reading = observe_all(params, states)
     assert np.abs(reading.angle).max() <= 45.0 + 1e-3
     assert np.abs(reading.angle).mean() == pytest.approx(22.5, abs=1.1)
 
@@ -263,14 +263,14 @@ def test_vmap_over_maps_equals_a_loop() -> None:
     three = [scenarios.scenario(n) for n in (1, 2, 3)]
     keys = jax.random.split(jax.random.key(4), 3)
 
-    def one(key: jax.Array, params: world.Params) -> tuple[world.Reading, world.State]:
-        state = world.reset(key, params)
-        return world.observe(state, params), world.step(state, 5.0, params)[0]
+    def one(key: jax.Array, params: world.WorldParams) -> tuple[world.Reading, world.WorldState]:
+        state = world.reset(params, key=key)
+        return world.observe(params, state), world.step(params, state, 5.0)[0]
 
     together = jax.jit(jax.vmap(one))(keys, maps.stack_maps(three))
     for i, params in enumerate(three):
-        state = reset(keys[i], params)
-        reading, after = observe(state, params), step(state, 5.0, params)[0]
+        state = reset(params, key=keys[i])
+        reading, after = observe(params, state), step(params, state, 5.0)[0]
         for a, b in zip(together[0], reading, strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-3)
         np.testing.assert_allclose(together[1].x[i], after.x, rtol=1e-6)
@@ -280,7 +280,7 @@ def test_vmap_over_maps_equals_a_loop() -> None:
 def test_non_finite_steering_stops_that_robot_only(bad: float) -> None:
     params = scenarios.scenario(1)
     states = reset_all(jax.random.split(jax.random.key(0), 2), params)
-    after, outcome = step_all(states, jnp.asarray([bad, 0.0]), params)
+    after, outcome = step_all(params, states, jnp.asarray([bad, 0.0]))
     assert outcome.failed.tolist() == [True, False]
     assert not (outcome.collided | outcome.arrived).any()
     assert after.x[0] == states.x[0]
@@ -292,7 +292,7 @@ def test_non_finite_steering_stops_that_robot_only(bad: float) -> None:
 
 
 def test_moving_circle_runs_into_a_robot_that_it_would_jump_over() -> None:
-    """The circle moves 200 px per step through the robot's place: only a swept test sees it."""
+    """The circle moves 200 px per step through the robot's map: only a swept test sees it."""
     params = maps.make_map(
         circles=[(100, 300, 20)],
         circle_velocity=[(200, 0)],
@@ -301,11 +301,11 @@ def test_moving_circle_runs_into_a_robot_that_it_would_jump_over() -> None:
         starts=[(200, 300, 0)],
         speed=1e-3,
     )
-    state = reset(jax.random.key(0), params)
-    _, outcome = step(state, 0.0, params)
+    state = reset(params, key=jax.random.key(0))
+    _, outcome = step(params, state, 0.0)
     assert outcome.collided
     parked = params._replace(circle_velocity=jnp.zeros_like(params.circle_velocity))
-    assert not step(state, 0.0, parked)[1].collided
+    assert not step(parked, state, 0.0)[1].collided
 
 
 def test_obstacles_patrol_and_sonars_see_them_move() -> None:
@@ -317,8 +317,8 @@ def test_obstacles_patrol_and_sonars_see_them_move() -> None:
         starts=[(100, 300, 0)],
         heading_spread=0.0,
     )
-    state = reset(jax.random.key(0), params)
-    ahead = [float(observe(state._replace(t=jnp.int32(t)), params).sonar[2]) for t in range(6)]
+    state = reset(params, key=jax.random.key(0))
+    ahead = [float(observe(params, state._replace(t=jnp.int32(t))).sonar[2]) for t in range(6)]
     np.testing.assert_allclose(ahead, [200, 190, 180, 190, 200, 190], atol=1e-3)
 
 
@@ -333,9 +333,9 @@ def test_noise_has_the_stated_deviation_and_failed_sonars_stick() -> None:
         angle_noise=1.0,
         sonar_stuck={1: 0.0, 4: 120.0},
     )
-    state = reset(jax.random.key(0), noisy)._replace(heading=jnp.float32(np.pi))
+    state = reset(noisy, key=jax.random.key(0))._replace(heading=jnp.float32(np.pi))
     states = jax.vmap(lambda t: state._replace(t=t))(jnp.arange(2000))
-    reading = observe_all(states, noisy)
+    reading = observe_all(noisy, states)
     assert reading.sonar[:, 2].std() == pytest.approx(3.0, rel=0.1)
     assert reading.sonar[:, 2].mean() == pytest.approx(150.0, abs=0.4)
     assert reading.distance.std() == pytest.approx(2.0, rel=0.1)
@@ -345,39 +345,39 @@ def test_noise_has_the_stated_deviation_and_failed_sonars_stick() -> None:
     assert off.std() == pytest.approx(1.0, rel=0.1)
     assert (reading.sonar[:, 1] == 0.0).all()
     assert (reading.sonar[:, 4] == 120.0).all()
-    again = observe(state, noisy)
-    np.testing.assert_array_equal(again.sonar, observe(state, noisy).sonar)
-    clean = reset(jax.random.key(0), plain)
+    again = observe(noisy, state)
+    np.testing.assert_array_equal(again.sonar, observe(noisy, state).sonar)
+    clean = reset(plain, key=jax.random.key(0))
     np.testing.assert_array_equal(
-        observe(clean, plain).sonar,
-        observe(clean._replace(key=jax.random.key(9)), plain).sonar,
+        observe(plain, clean).sonar,
+        observe(plain, clean._replace(key=jax.random.key(9))).sonar,
     )
 
 
 def test_robots_in_one_world_see_and_hit_one_another() -> None:
     params = maps.make_map(target=(400, 550), starts=[(100, 100, 0)])
-    one = reset(jax.random.key(0), params)
+    one = reset(params, key=jax.random.key(0))
     states = jax.tree.map(lambda a: jnp.broadcast_to(a, (3, *a.shape)), one)._replace(
         x=jnp.asarray([100.0, 160.0, 100.0]),
         y=jnp.asarray([300.0, 300.0, 500.0]),
         heading=jnp.asarray([0.0, np.pi, 0.0], jnp.float32),
     )
     everyone = jnp.ones(3, bool)
-    reading = jax.jit(world.observe_many)(states, params, active=everyone)
+    reading = jax.jit(world.observe_many)(params, states, active=everyone)
     np.testing.assert_allclose(reading.sonar[:2, 2], 60.0 - 6.0, rtol=1e-5)
     np.testing.assert_allclose(reading.sonar[2, 2], 300.0)
     fast = params._replace(speed=jnp.float32(100.0))  # they would swap places
     step_many = jax.jit(world.step_many)
-    after, outcome = step_many(states, jnp.zeros(3), fast, active=everyone)
+    after, outcome = step_many(fast, states, jnp.zeros(3), active=everyone)
     assert outcome.collided.tolist() == [True, True, False]
     # They meet half way, their centres two radii apart.
     np.testing.assert_allclose(after.x[1] - after.x[0], 12.0, atol=1e-3)
     np.testing.assert_allclose((after.x[0] + after.x[1]) / 2, 130.0, atol=1e-3)
     alone = jnp.asarray([True, False, True])
-    after, outcome = step_many(states, jnp.zeros(3), fast, active=alone)
+    after, outcome = step_many(fast, states, jnp.zeros(3), active=alone)
     assert not outcome.collided.any()
     assert after.x[1] == 160.0
     with pytest.raises(ValueError, match="at least one robot"):
         world.step_many(
-            jax.tree.map(lambda a: a[:0], states), jnp.zeros(0), fast, active=jnp.zeros(0, bool)
+            fast, jax.tree.map(lambda a: a[:0], states), jnp.zeros(0), active=jnp.zeros(0, bool)
         )

@@ -8,7 +8,7 @@ import importlib
 import numpy as np
 import pytest
 
-from jaxsnn.presets import network_setting
+from jaxsnn.presets import preset
 from snn_fusion_failure.sweeps import axes
 from snn_fusion_failure.sweeps.axes import Axis, parse_axis
 from snn_fusion_failure.sweeps.designs import design, digest
@@ -70,7 +70,7 @@ def test_what_cannot_be_read_is_named(text: str, message: str) -> None:
 
 
 def test_every_leaf_of_a_network_can_be_named() -> None:
-    _, params = network_setting("S4")
+    _, params = preset("S4")
     names = leaf_names(params)
     assert {"gamma", "stdp.tau_z", "reward.k", "hidden.tau_m", "homeostasis"} <= set(names)
     for place, name in enumerate(names):

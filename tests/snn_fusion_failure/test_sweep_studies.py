@@ -64,11 +64,11 @@ def test_snn_side_by_side_is_one_by_one() -> None:
 def test_snn_times_are_in_milliseconds() -> None:
     study = load_study("snn", [])
     short = study.params._replace(stdp=study.params.stdp._replace(tau_z=np.array([2.5e-5])))
-    with pytest.raises(ValueError, match=r"tau_z = 0.025 ms is below the step .* or 0.025s"):
+    with pytest.raises(ValueError, match=r"tau_z=0.025: expected at least the step .* or 0.025s"):
         study.check(short)
     for options, message in [
-        (["scenario=4"], "scenario = 4"),
-        (["network=S5"], "S5"),
+        (["scenario=4"], "scenario=4"),
+        (["model=S5"], "S5"),
         (["n_learn=0"], "n_learn=0"),
     ]:
         with pytest.raises(ValueError, match=message):

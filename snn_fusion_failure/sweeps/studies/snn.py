@@ -16,9 +16,10 @@ import numpy as np
 from jaxsnn import scenarios
 from jaxsnn.agents import snn_params
 from jaxsnn.config import check_network
-from jaxsnn.presets import network_setting
-from jaxsnn.trials import ARRIVED, NON_FINITE, TrialResult, run_experiment
-from snn_fusion_failure.commands.train_snn import TEST_TRIALS, learning_circles, parse_changes
+from jaxsnn.experiment import TEST_TRIALS, learning_circles, run_experiment
+from jaxsnn.status import Status
+from jaxsnn.trials import TrialResult
+from snn_fusion_failure.runs.networks import changed_preset
 from snn_fusion_failure.sweeps.study import Metric, Study
 
 __all__ = ["make"]
@@ -39,28 +40,28 @@ def _unit(leaf: str) -> str:
 
 
 def make(
-    network: str = "S4",
-    setting: str = "tuned",
+    model: str = "S4",
+    reading: str = "tuned",
     scenario: int = 1,
     n_learn: int = 20,
     n_test: int = 0,
     max_steps: int = 200,
     changes: tuple[str, ...] = (),
 ) -> Study:
-    """A network in a named setting on one of the source's maps; `n_test=0`: as in the source."""
+    """A preset of a network on one of the source's maps; `n_test=0`: as in the source."""
     if scenario not in TEST_TRIALS:
-        raise ValueError(f"scenario = {scenario}: expected one of {sorted(TEST_TRIALS)}")
+        raise ValueError(f"scenario={scenario}: expected one of {sorted(TEST_TRIALS)}; choose one")
     tests = n_test or TEST_TRIALS[scenario]
     if min(n_learn, tests, max_steps) < 1:
-        raise ValueError(f"{n_learn=}, {n_test=}, {max_steps=}: expected at least 1")
-    config, constants = network_setting(network, setting, **parse_changes(tuple(changes)))
-    place = scenarios.scenario(scenario)
+        raise ValueError(f"{n_learn=}, {n_test=}, {max_steps=}: expected at least 1; raise them")
+    config, constants = changed_preset(model, reading, tuple(changes))
+    map = scenarios.scenario(scenario)
     circles = learning_circles(scenario, n_learn)
 
     def run(params: Any, keys: Any) -> dict[str, Any]:
         prepared = jax.vmap(lambda p: snn_params(config, p))(params)
         out = run_experiment(
-            config, prepared, place, keys, n_learn=n_learn, n_test=tests, max_steps=max_steps,
+            config, prepared, map, keys=keys, n_learn=n_learn, n_test=tests, max_steps=max_steps,
             block=keys.shape[0], circles=circles, params_axis=0,
         )  # fmt: skip
         return {
@@ -78,13 +79,13 @@ def make(
                 if ((values > 0.0) & (values < config.dt)).any():
                     least = 1e3 * float(values[values > 0.0].min())
                     raise ValueError(
-                        f"{name} = {least:g} ms is below the step of {1e3 * config.dt:g} ms; times "
-                        "are swept in milliseconds, so write 25 or 25ms or 0.025s"
+                        f"{name}={least:g}: expected at least the step of {1e3 * config.dt:g} ms; "
+                        "times are swept in milliseconds, so write 25 or 25ms or 0.025s"
                     )
 
     def with_budget(budget: int) -> Study:
         # Ranked by the learning trials so far; one testing trial is the least that can be run.
-        return make(network, setting, scenario, budget, 1, max_steps, changes)
+        return make(model, reading, scenario, budget, 1, max_steps, changes)
 
     return Study(
         name="snn",
@@ -107,12 +108,12 @@ def make(
 
 def _success(phase: TrialResult) -> Any:
     """Arrivals in percent; NaN for a robot whose state broke."""
-    share = 100.0 * jnp.mean((phase.status == ARRIVED).astype(jnp.float32), axis=-1)
-    return jnp.where(jnp.any(phase.status == NON_FINITE, axis=-1), jnp.nan, share)
+    share = 100.0 * jnp.mean((phase.status == Status.ARRIVED).astype(jnp.float32), axis=-1)
+    return jnp.where(jnp.any(phase.status == Status.NON_FINITE, axis=-1), jnp.nan, share)
 
 
 def _mean_of_arrivals(phase: TrialResult, values: Any) -> Any:
     """Mean over the trials that arrived; NaN when none did."""
-    arrived = phase.status == ARRIVED
+    arrived = phase.status == Status.ARRIVED
     count = jnp.sum(arrived, axis=-1).astype(jnp.float32)
     return jnp.sum(jnp.where(arrived, values, 0.0), axis=-1) / count

@@ -1,0 +1,107 @@
+"""Drivers that learn nothing: what a map demands, measured before anything is trained on it.
+
+The blind driver turns to the target and ignores its sonars. The reflex does the same until a sonar
+reads less than `distance`; then it turns away from the nearer side. A map that one of them solves
+says nothing about learning to avoid obstacles.
+"""
+
+from __future__ import annotations
+
+import functools
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Key
+
+from jaxsnn import world
+from jaxsnn.agents import Agent
+from jaxsnn.trials import TrialResult, run_phase
+
+__all__ = ["DRIVERS", "DriverParams", "drive", "driver_agent", "driver_steering"]
+
+
+class DriverParams(NamedTuple):
+    """Constants of a driver; may be traced.
+
+    Attributes:
+        distance: a sonar below this sets the reflex off [px]; 0 is the blind driver.
+        turn: size of the reflex's turn [deg].
+        limit: largest turn towards the target [deg].
+    """
+
+    distance: float | Array = 60.0
+    turn: float | Array = 40.0
+    limit: float | Array = 30.0
+
+
+DRIVERS = {
+    "blind": DriverParams(distance=0.0),
+    "reflex_60": DriverParams(distance=60.0),
+    "reflex_100": DriverParams(distance=100.0),
+}
+"""The three drivers that every table of navigation carries."""
+
+
+def driver_steering(params: DriverParams, reading: world.Reading) -> Float[Array, ""]:
+    r"""Turn of a driver for a reading [deg], positive to the left.
+
+    .. math:: \theta = \begin{cases} \pm \text{turn} & \min_i s_i < \text{distance} \\
+              \mathrm{clip}(\beta, -\text{limit}, \text{limit}) & \text{else} \end{cases}
+
+    to the right when the left side is nearer, to the left otherwise.
+    """
+    half = reading.sonar.shape[0] // 2
+    left, right = jnp.min(reading.sonar[:half]), jnp.min(reading.sonar[half + 1 :])
+    away = jnp.where(left < right, -params.turn, params.turn)
+    ahead = jnp.clip(reading.angle, -params.limit, params.limit)
+    return jnp.where(jnp.min(reading.sonar) < params.distance, away, ahead)
+
+
+def driver_agent() -> Agent:
+    """A driver as an agent: its parameters are DriverParams, its state is not used."""
+
+    def act(
+        params: DriverParams,
+        state: Any,
+        reading: world.Reading,
+        fresh: Bool[Array, ""],
+        active: Bool[Array, ""],
+        *,
+        key: Key[Array, ""],
+    ) -> tuple[Any, Float[Array, ""], None, Float[Array, "0"]]:
+        return state, driver_steering(params, reading), None, jnp.zeros((0,))
+
+    return Agent(
+        init=lambda key, params: jnp.zeros(()),
+        act=act,
+        learn=lambda params, state, memory, outcome, next_reading, active: state,
+        finite=jnp.isfinite,
+    )
+
+
+@functools.partial(jax.jit, static_argnames=("n_trials", "max_steps"))
+def drive(
+    params: DriverParams,
+    map: world.WorldParams,
+    *,
+    keys: Key[Array, " robots"],
+    n_trials: int = 10,
+    max_steps: int = 200,
+) -> TrialResult:
+    """Drive robots over a map; compiled once for all drivers and all maps of equal padding.
+
+    Returns:
+        TrialResult, leaves `[robots, trials]`.
+
+    Example:
+        >>> from jaxsnn import scenario, success_rate
+        >>> keys = jax.random.split(jax.random.key(0), 4)
+        >>> success_rate(drive(DRIVERS["blind"], scenario(1), keys=keys)).tolist()
+        [1.0, 1.0, 1.0, 1.0]
+    """
+    states = jnp.zeros(keys.shape[0])
+    _, result = run_phase(
+        driver_agent(), params, map, states, keys=keys, n_trials=n_trials, max_steps=max_steps
+    )
+    return result

@@ -57,7 +57,7 @@ assert float(data["spread"].sel(width=3.0).mean()) > 2.0
 
 SIMULATOR = """
 def simulate(x):
-    return -abs(x[:, :1] - 2.5).sum(axis=1)
+    return -abs(x - 2.5).sum()
 """
 
 
@@ -135,9 +135,8 @@ def check_commands(programs: Path, folder: Path) -> int:
         ([*sweep, "--out", "runs/two", "--quiet", "--workers", "2"], "complete=True"),
         ([sff, "sweep", "show", "runs/shell"], "width"),
         ([sff, "train-argate", "--dataset", "simulated", "--preset", "quick"], "result: "),
-        ([sff, "find-failures", "--circuit", "my_simulator:simulate", "--bounds=-3:3",
-          "--dimensions", "3", "--n-init", "10", "--n-total", "20", "--threshold=-0.5"],
-         "result: "),
+        ([sff, "find-failures", "--circuit", "my_simulator:simulate", "--dimensions", "2",
+          "--spec", "value", "--preset", "quick", "--threshold=-1"], "success=1"),
     ]  # fmt: skip
     for command, wanted in commands:
         print("==", " ".join(Path(c).name if c == command[0] else c for c in command), flush=True)

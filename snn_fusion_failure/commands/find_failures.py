@@ -39,7 +39,9 @@ class Config:
     """What to search and how."""
 
     circuit: str = "ldo"
-    """Circuit name."""
+    """Circuit name, or module:function of yours, `x [d] -> value` (with --spec value)."""
+    dimensions: int | None = None
+    """Numbers that a function of yours takes."""
     spec: str = "undershoot"
     """Specification name."""
     method: str = "full"
@@ -100,17 +102,17 @@ def main(config: Config) -> dict[str, Any]:
     """Run the searches; returns the result that is also written."""
     import numpy as np
 
-    from failure import circuits
     from failure.search.bayesopt import METHODS, SearchState, best_so_far, first_hit
     from failure.search.runs import run
     from failure.search.spaces import Task
+    from snn_fusion_failure.commands.own_circuit import find_circuit
     from snn_fusion_failure.records import failure_runs
 
     if config.verify not in (None, "ngspice"):
         raise ValueError(f"verify={config.verify!r}: expected 'ngspice' or nothing")
     if config.seeds < 1:
         raise ValueError(f"seeds={config.seeds}: expected at least 1")
-    circuit = circuits.get(config.circuit)
+    circuit = find_circuit(config.circuit, config.dimensions)
     column = circuit.spec_index(config.spec)
     spec = circuit.specs[column]
     size = circuit.box if config.task == "box" else config.radius

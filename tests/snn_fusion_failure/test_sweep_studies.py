@@ -128,7 +128,7 @@ def test_failure_refuses_what_makes_no_search() -> None:
             study.check(tree._replace(**{leaf: np.array([value])}))
     with pytest.raises(ValueError, match="n_init=60"):
         load_study("failure", ["n_init=60"])
-    with pytest.raises(ValueError, match="expected one of .dcdc):
+    with pytest.raises(ValueError, match=r"expected one of .dcdc"):
         load_study("failure", ["circuit=opamp"])
 
 

@@ -1,43 +1,59 @@
 """Rare-failure search for analog and mixed-signal circuits.
 
-Circuits: `circuits`, and `simulators` for your own. Search: `gp`, `gp_fit`, `acquisition`,
-`spaces`, `bayesopt`, `turbo`, `baselines`, `runs`. Learned spaces: `revnet`, `bnn`. How likely:
-`rare_events`. Imported by name only, for what they bring along: `failure.rev_argate` (the fusion
-package), `failure.plots` (matplotlib).
+What is listed here is kept stable; the rest of the package may change.
+
+- Simulators: `circuits.get(name)`, `CommandSimulator`, `FunctionSimulator`, `Status`.
+- Search: `Task`, `SearchConfig`, `METHODS`, `run_search`, `start_from`, or `ask` and `tell` by
+  hand; `GPConfig`, `AcquisitionConfig`, `TurboConfig`; `first_hit`, `best_so_far`.
+- How likely: `design_points`, `importance_sampling`, `subset_simulation`, `monte_carlo`.
+
+Imported by name only, for what they bring along: `failure.rev_argate` (the fusion package),
+`failure.plots` (matplotlib).
 """
 
-from failure import bnn, circuits, rare_events, revnet, simulators
-from failure.models import acquisition, gp, gp_fit, optimize
-from failure.rare_events import importance_sampling, monte_carlo, subset_simulation
-from failure.search import baselines, bayesopt, runs, sharing, spaces, thresholds, turbo
-from failure.search.bayesopt import SearchConfig, ask, tell
+from failure import circuits
+from failure.form import design_points
+from failure.models.acquisition import AcquisitionConfig
+from failure.models.kernels import GPConfig
+from failure.rare_events import Estimate, importance_sampling, monte_carlo, subset_simulation
+from failure.search.bayesopt import ask, tell
+from failure.search.history import SearchState, best_so_far, first_hit
+from failure.search.methods import METHODS, SearchConfig
+from failure.search.runs import run as run_search
+from failure.search.runs import samples, start_from
+from failure.search.sharing import side_by_side
+from failure.search.subspace import subspace_of_gradient
+from failure.search.task import Task
+from failure.search.thresholds import reachable
+from failure.search.turbo import TurboConfig
 from failure.simulators.wrappers import CommandSimulator, FunctionSimulator
 from failure.status import Status
 
 __all__ = [
+    "METHODS",
+    "AcquisitionConfig",
     "CommandSimulator",
+    "Estimate",
     "FunctionSimulator",
+    "GPConfig",
     "SearchConfig",
+    "SearchState",
     "Status",
-    "acquisition",
+    "Task",
+    "TurboConfig",
     "ask",
-    "baselines",
-    "bayesopt",
-    "bnn",
+    "best_so_far",
     "circuits",
-    "gp",
-    "gp_fit",
+    "design_points",
+    "first_hit",
     "importance_sampling",
     "monte_carlo",
-    "optimize",
-    "rare_events",
-    "revnet",
-    "runs",
-    "sharing",
-    "simulators",
-    "spaces",
+    "reachable",
+    "run_search",
+    "samples",
+    "side_by_side",
+    "start_from",
     "subset_simulation",
+    "subspace_of_gradient",
     "tell",
-    "thresholds",
-    "turbo",
 ]

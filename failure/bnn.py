@@ -14,6 +14,7 @@ from jaxtyping import Array, Float, Int, Key
 __all__ = [
     "BNNConfig",
     "BNNParams",
+    "BNNTrainParams",
     "LinearPosterior",
     "fit",
     "fit_linear",
@@ -28,17 +29,40 @@ __all__ = [
 
 @dataclass(frozen=True)
 class BNNConfig:
-    """Size, prior and training of the network.
+    """Size of the network and length of its training.
 
-    `prior_scale` is the standard deviation of a weight times the square root of its fan-in.
+    Attributes:
+        hidden: hidden units.
+        steps: Adam steps.
+        n_samples: weight samples per step.
+
+    Raises:
+        ValueError: a number below one.
     """
 
     hidden: int = 64
+    steps: int = 2000
+    n_samples: int = 1
+
+    def __post_init__(self) -> None:
+        """Refuse a network that is none."""
+        for name in ("hidden", "steps", "n_samples"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: expected at least 1")
+
+
+class BNNTrainParams(NamedTuple):
+    """Prior and training, floats that a sweep may vary without a new program.
+
+    Attributes:
+        prior_scale: standard deviation of a weight times the square root of its fan-in.
+        init_log_sd: log standard deviation that all weights start with.
+        learning_rate: of Adam, cosine decay.
+    """
+
     prior_scale: float = 1.0
     init_log_sd: float = -4.0
-    steps: int = 2000
     learning_rate: float = 1e-2
-    n_samples: int = 1
 
 
 class BNNParams(NamedTuple):
@@ -67,7 +91,7 @@ class LinearPosterior(NamedTuple):
 
 def _moments(x: Array) -> tuple[Array, Array]:
     mean, sd = jnp.mean(x, 0), jnp.std(x, 0)
-    return mean, jnp.where(sd > 1e-9, sd, jnp.ones_like(sd))
+    return mean, jnp.where(sd > 1e-6 * jnp.abs(mean), sd, jnp.ones_like(sd))
 
 
 def _check(x: Array, y: Array) -> None:
@@ -78,7 +102,11 @@ def _check(x: Array, y: Array) -> None:
 
 
 def init(
-    key: Key[Array, ""], config: BNNConfig, x: Float[Array, "n i"], y: Float[Array, "m o"]
+    key: Key[Array, ""],
+    config: BNNConfig,
+    training: BNNTrainParams,
+    x: Float[Array, "n i"],
+    y: Float[Array, "m o"],
 ) -> BNNParams:
     """Initial posterior: small random means, narrow spread, moments of the data."""
     _check(x, y)
@@ -90,7 +118,7 @@ def init(
         0.1 * jax.random.normal(key2, (h, n_out), x.dtype) / math.sqrt(h),
         jnp.zeros((n_out,), x.dtype),
     )
-    log_sd = tuple(jnp.full_like(w, config.init_log_sd) for w in weights)
+    log_sd = tuple(jnp.full_like(w, training.init_log_sd) for w in weights)
     return BNNParams(
         weights,
         (log_sd[0], log_sd[1], log_sd[2], log_sd[3]),
@@ -112,23 +140,25 @@ def _hidden_and_output(params: BNNParams, x: Array, noise1: Array, noise2: Array
     return out + noise2 * spread2
 
 
-def _kl(config: BNNConfig, params: BNNParams) -> Array:
+def _kl(training: BNNTrainParams, params: BNNParams) -> Array:
     """KL divergence from the factorised posterior to the normal prior."""
     n_in, h = params.weights[0].shape
     total = jnp.zeros((), params.log_noise.dtype)
     scales = (n_in**-0.5, 1.0, h**-0.5, 1.0)
     for mean, log_sd, scale in zip(params.weights, params.log_sd, scales, strict=True):
-        prior = config.prior_scale * scale
+        prior = jnp.asarray(training.prior_scale * scale, mean.dtype)
         ratio = (jnp.exp(2.0 * log_sd) + mean**2) / prior**2
-        total = total + 0.5 * jnp.sum(ratio - 1.0 - 2.0 * log_sd + 2.0 * math.log(prior))
+        total = total + 0.5 * jnp.sum(ratio - 1.0 - 2.0 * log_sd + 2.0 * jnp.log(prior))
     return total
 
 
 def negative_elbo(
     config: BNNConfig,
+    training: BNNTrainParams,
     params: BNNParams,
     x: Float[Array, "n i"],
     y: Float[Array, "n o"],
+    *,
     key: Key[Array, ""],
 ) -> Float[Array, ""]:
     r"""Negative evidence lower bound per data point.
@@ -136,7 +166,8 @@ def negative_elbo(
     .. math:: -\mathbb E_q[\log p(y \mid x, w)] + \mathrm{KL}(q(w) \,\|\, p(w))
 
     Args:
-        config: prior and number of samples.
+        config: number of samples.
+        training: the prior.
         params: the variational posterior.
         x: inputs.
         y: targets.
@@ -158,19 +189,25 @@ def negative_elbo(
         return 0.5 * jnp.sum(error * precision) + n * jnp.sum(params.log_noise)
 
     fit_term = jnp.mean(jax.vmap(one)(jax.random.split(key, config.n_samples)))
-    return (fit_term + _kl(config, params)) / n
+    return (fit_term + _kl(training, params)) / n
 
 
 def fit(
-    key: Key[Array, ""], config: BNNConfig, x: Float[Array, "n i"], y: Float[Array, "m o"]
+    config: BNNConfig,
+    training: BNNTrainParams,
+    x: Float[Array, "n i"],
+    y: Float[Array, "m o"],
+    *,
+    key: Key[Array, ""],
 ) -> tuple[BNNParams, Float[Array, " t"]]:
     """Train the posterior by Adam in one scan.
 
     Args:
-        key: random key.
-        config: sizes and training.
+        config: sizes and steps.
+        training: prior and learning rate.
         x: inputs `z_act`.
         y: targets `z_inact`.
+        key: random key.
 
     Returns:
         `(posterior, negative ELBO of every step)`.
@@ -179,8 +216,9 @@ def fit(
         ValueError: rows of `x` and `y` differ, or fewer than 2.
     """
     key_init, key_fit = jax.random.split(key)
-    params = init(key_init, config, x, y)
-    optimiser = optax.adam(optax.cosine_decay_schedule(config.learning_rate, config.steps))
+    params = init(key_init, config, training, x, y)
+    with jax.numpy_dtype_promotion("standard"):
+        optimiser = optax.adam(optax.cosine_decay_schedule(1.0, config.steps))
     free = (params.weights, params.log_sd, params.log_noise)
 
     def join(free: Any) -> BNNParams:
@@ -188,10 +226,14 @@ def fit(
 
     def step(carry: tuple, sub: Array) -> tuple[tuple, Array]:
         free, state = carry
-        loss, grad = jax.value_and_grad(lambda f: negative_elbo(config, join(f), x, y, sub))(free)
+        loss, grad = jax.value_and_grad(
+            lambda f: negative_elbo(config, training, join(f), x, y, key=sub)
+        )(free)
         # optax raises a Python float to an integer power, which strict promotion forbids.
         with jax.numpy_dtype_promotion("standard"):
             update, state = optimiser.update(grad, state)
+        # The rate is a number of the run, not of the program: a sweep over it compiles nothing.
+        update = jax.tree.map(lambda u: jnp.asarray(training.learning_rate, u.dtype) * u, update)
         return (optax.apply_updates(free, update), state), loss
 
     keys = jax.random.split(key_fit, config.steps)
@@ -200,7 +242,7 @@ def fit(
 
 
 def sample(
-    params: BNNParams, key: Key[Array, ""], x: Float[Array, "n i"], n_samples: int
+    params: BNNParams, x: Float[Array, "n i"], n_samples: int, *, key: Key[Array, ""]
 ) -> Float[Array, "s n o"]:
     """Draw functions from the posterior (without observation noise), one weight set per sample."""
     scaled = (x - params.x_shift[None]) / params.x_scale[None]
@@ -288,7 +330,7 @@ def predict_linear(
 
 
 def sample_linear(
-    posterior: LinearPosterior, key: Key[Array, ""], x: Float[Array, "n i"], n_samples: int
+    posterior: LinearPosterior, x: Float[Array, "n i"], n_samples: int, *, key: Key[Array, ""]
 ) -> Float[Array, "s n o"]:
     """Draw linear functions from the posterior."""
     phi = _design(x)

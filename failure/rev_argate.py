@@ -13,7 +13,6 @@ import optax
 from jaxtyping import Array, Float, Key
 
 from failure import bnn, revnet
-from failure.search.spaces import ReversedFeatures, Task, unit_scale
 from fusion.gating import Gate, apply_weights
 from fusion.losses import LossParams, loss_targets
 from fusion.targets import TargetConfig, apply_targets, init_targets, project_targets
@@ -21,48 +20,78 @@ from fusion.targets import TargetConfig, apply_targets, init_targets, project_ta
 __all__ = [
     "RevArgateConfig",
     "RevArgateParams",
+    "RevArgateTrainParams",
     "active_features",
     "check_active",
     "fit",
     "fusion_weights",
     "init",
     "loss",
-    "make_space",
     "predict",
-    "train_space",
 ]
 
 
 @dataclass(frozen=True)
 class RevArgateConfig:
-    """Sizes, loss weights and training; the source states none of these (see docs/rev_argate.md).
+    """Sizes and length of training; the source states none of these (see docs/rev_argate.md).
 
     Attributes:
         depth: RevNet blocks.
         step: time step h of a block.
         feature_width: width of the path behind each feature.
         gate_width: hidden units of the gate.
-        loss: weights of the auxiliary losses (Equation 4.6), of the fusion-weight regularisation
-            and of the anchor of the learned targets (0 is the loss as printed), and the
-            temperature of the fixed targets that they are anchored to.
         steps: Adam steps on all data.
-        learning_rate: of Adam, cosine decay.
-        weight_decay: decoupled; 50 simulations in 60 dimensions overfit without.
+        targets: the lattice networks of the learned targets.
         restoration: the Bayesian network.
+
+    Raises:
+        ValueError: a number out of range.
     """
 
     depth: int = 6
     step: float = 0.25
     feature_width: int = 4
     gate_width: int = 32
-    loss: LossParams = field(
-        default_factory=lambda: LossParams(alpha=1.0, beta=1.0, tau=0.05, anchor=1.0)
-    )
     steps: int = 600
-    learning_rate: float = 3e-3
-    weight_decay: float = 1e-3
     targets: TargetConfig = field(default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0)))
     restoration: bnn.BNNConfig = field(default_factory=lambda: bnn.BNNConfig(hidden=32, steps=500))
+
+    def __post_init__(self) -> None:
+        """Refuse a network that is none."""
+        for name in ("depth", "feature_width", "gate_width", "steps"):
+            if getattr(self, name) < 1:
+                raise ValueError(f"{name}={getattr(self, name)}: expected at least 1")
+        if not self.step > 0.0:
+            raise ValueError(f"step={self.step}: expected a positive time step")
+
+
+class RevArgateTrainParams(NamedTuple):
+    """Loss weights and rates: floats that a sweep may vary without a new program.
+
+    Attributes:
+        loss: weights of the auxiliary losses (Equation 4.6), of the fusion-weight regularisation
+            and of the anchor of the learned targets (0 is the loss as printed), and the
+            temperature of the fixed targets that they are anchored to.
+        learning_rate: of Adam, cosine decay.
+        weight_decay: decoupled; 50 simulations in 60 dimensions overfit without.
+        restoration: prior and rate of the Bayesian network.
+    """
+
+    loss: LossParams = LossParams(alpha=1.0, beta=1.0, tau=0.05, anchor=1.0)
+    learning_rate: float | Array = 3e-3
+    weight_decay: float | Array = 1e-3
+    restoration: bnn.BNNTrainParams = bnn.BNNTrainParams()
+
+    def check(self) -> None:
+        """Refuse rates that are none, before they are traced; `loss` checks its own.
+
+        Raises:
+            ValueError: a negative rate.
+        """
+        for name in ("learning_rate", "weight_decay"):
+            value = getattr(self, name)
+            if not np.all(np.asarray(value) >= 0):
+                raise ValueError(f"{name}={value}: expected a number of at least 0")
 
 
 class RevArgateParams(NamedTuple):
@@ -126,6 +155,7 @@ def predict(
 
 def loss(
     config: RevArgateConfig,
+    training: RevArgateTrainParams,
     params: RevArgateParams,
     x: Float[Array, "n d"],
     y: Float[Array, " n"],
@@ -140,7 +170,8 @@ def loss(
     with squared errors, means over the rows, and :math:`f_k` falling in its own loss.
 
     Args:
-        config: :math:`\alpha, \beta, \tau` and :math:`\lambda` = `anchor` in `config.loss`.
+        config: sizes.
+        training: :math:`\alpha, \beta, \tau` and :math:`\lambda` = `anchor` in `training.loss`.
         params: all weights.
         x: inputs, unit variance.
         y: standardised outputs.
@@ -165,44 +196,59 @@ def loss(
     aux_losses = jnp.sum(mask[:, None] * (aux - y[:, None]) ** 2, 0) / count
     mean_weights = jnp.sum(mask[:, None] * weights, 0) / count
     auxiliary = jnp.sum(mean_weights * aux_losses)
-    seen = jax.lax.stop_gradient(aux_losses)[None]
-    targets = apply_targets(config.targets, params.targets, seen)
-    fixed = loss_targets(seen, "softmax", config.loss.tau)
+    observed = jax.lax.stop_gradient(aux_losses)[None]
+    targets = apply_targets(config.targets, params.targets, observed)
+    weight = training.loss
+    fixed = loss_targets(observed, "softmax", weight.tau)
     pull = jnp.sum(mask * jnp.sum((weights - targets) ** 2, 1)) / count
     anchor = jnp.sum((targets - fixed) ** 2)
-    weigh = config.loss
-    total = main + weigh.alpha * auxiliary + weigh.beta * pull + weigh.anchor * anchor
+    total = main + weight.alpha * auxiliary + weight.beta * pull + weight.anchor * anchor
     return total, main
 
 
 def fit(
-    key: Key[Array, ""],
     config: RevArgateConfig,
+    training: RevArgateTrainParams,
     x: Float[Array, "n d"],
     y: Float[Array, " n"],
     mask: Float[Array, " n"],
+    *,
+    key: Key[Array, ""],
 ) -> tuple[RevArgateParams, Float[Array, " t"]]:
     """Train by Adam on all rows, one scan; lattices are projected after every step.
+
+    Args:
+        config: static sizes.
+        training: loss weights and rates; traceable, so that a sweep over them compiles once.
+        x: inputs, unit variance.
+        y: standardised outputs.
+        mask: 1 for rows that count.
+        key: random key.
 
     Returns:
         `(params, main loss of every step)`.
     """
     params = init(key, config, x.shape[1])
-    schedule = optax.cosine_decay_schedule(config.learning_rate, config.steps)
-    optimiser = optax.chain(
-        optax.clip_by_global_norm(1.0), optax.adamw(schedule, weight_decay=config.weight_decay)
-    )
+    optimiser = optax.chain(optax.clip_by_global_norm(1.0), optax.scale_by_adam())
+    decay = optax.cosine_decay_schedule(1.0, config.steps)
 
-    def step(carry: tuple[Any, Any], _: None) -> tuple[tuple[Any, Any], Array]:
+    def step(carry: tuple[Any, Any], t: Array) -> tuple[tuple[Any, Any], Array]:
         params, state = carry
-        (_, main), grad = jax.value_and_grad(lambda p: loss(config, p, x, y, mask), has_aux=True)(
-            params
-        )
+        (_, main), grad = jax.value_and_grad(
+            lambda p: loss(config, training, p, x, y, mask), has_aux=True
+        )(params)
         # The time step h is a constant of the network, not a weight.
         grad = grad._replace(network=grad.network._replace(step=jnp.zeros_like(grad.network.step)))
         # optax raises a Python float to an integer power, which strict promotion forbids.
         with jax.numpy_dtype_promotion("standard"):
             update, state = optimiser.update(grad, state, params)
+            rate = -jnp.asarray(training.learning_rate, x.dtype) * decay(t)
+            # Decoupled decay: the part of AdamW that takes its weight from the run.
+            update = jax.tree.map(
+                lambda u, p: rate * (u + jnp.asarray(training.weight_decay, u.dtype) * p),
+                update,
+                params,
+            )
         update = update._replace(
             network=update.network._replace(step=jnp.zeros_like(update.network.step))
         )
@@ -211,7 +257,7 @@ def fit(
         return (params, state), main
 
     (params, _), losses = jax.lax.scan(
-        step, (params, optimiser.init(params)), None, length=config.steps
+        step, (params, optimiser.init(params)), jnp.arange(config.steps)
     )
     return params, losses
 
@@ -237,12 +283,12 @@ def active_features(weights: Float[Array, "n d"], share: float | None = None) ->
 
 
 def check_active(
-    key: Key[Array, ""],
     z: Float[Array, "n d"],
     y: Float[Array, " n"],
     order: Any,
     n_active: int,
     *,
+    key: Key[Array, ""],
     hidden: int = 32,
     steps: int = 600,
 ) -> tuple[float, float]:
@@ -258,108 +304,9 @@ def check_active(
     for columns in (order[:n_active], order):
         config = bnn.BNNConfig(hidden=hidden, steps=steps)
         part = z[:, np.asarray(columns)]
-        params, _ = jax.jit(bnn.fit, static_argnums=1)(key, config, part[:-cut], y[:-cut, None])
+        params, _ = jax.jit(bnn.fit, static_argnums=0)(
+            config, bnn.BNNTrainParams(), part[:-cut], y[:-cut, None], key=key
+        )
         error = bnn.predict(params, part[-cut:])[:, 0] - y[-cut:]
         errors.append(float(jnp.sqrt(jnp.mean(error**2)) / jnp.std(y)))
     return errors[0], errors[1]
-
-
-def make_space(
-    key: Key[Array, ""],
-    config: RevArgateConfig,
-    task: Task,
-    n_active: int,
-    restore: bool,
-    x: Float[Array, "n d"],
-    y: Float[Array, " n"],
-) -> tuple[ReversedFeatures, Float[Array, " d"]]:
-    r"""Train on simulated samples and build the search space z_act -> x.
-
-    Active features range over :math:`m_k \pm \sqrt{d}\, s_k` with the mean and deviation of the
-    training data: the cube :math:`[-\sqrt d, \sqrt d]^d` of the source in units of the feature.
-
-    Args:
-        key: random key.
-        config: sizes and training.
-        task: the feasible set of x.
-        n_active: d, the number of features kept.
-        restore: train the Bayesian network for the others; zeros without.
-        x: simulated parameters in sigma.
-        y: outputs, NaN where invalid.
-
-    Returns:
-        `(space, mean fusion weight of every feature)`.
-    """
-    key_fit, key_bnn = jax.random.split(key)
-    x_scale = jnp.asarray(unit_scale(task) / math.sqrt(12.0), x.dtype)
-    good = jnp.isfinite(y)
-    mask = good.astype(x.dtype)
-    count = jnp.maximum(jnp.sum(mask), 2.0)
-    filled = jnp.where(good, y, jnp.zeros_like(y))
-    mean = jnp.sum(filled) / count
-    centred = jnp.where(good, filled - mean, jnp.zeros_like(y))
-    sd = jnp.sqrt(jnp.sum(centred**2) / count)
-    target = centred / jnp.where(sd > 0, sd, jnp.ones_like(sd))
-    params, _ = fit(key_fit, config, x / x_scale, target, mask)
-    weights = jnp.mean(fusion_weights(config, params, x / x_scale), 0)
-    order = jnp.argsort(-weights)
-    z = revnet.forward(params.network, x / x_scale)[:, order]
-    active, rest = z[:, :n_active], z[:, n_active:]
-    spread = jnp.std(active, 0)
-    restoration = None
-    if restore and n_active < x.shape[1]:
-        restoration, _ = bnn.fit(key_bnn, config.restoration, active, rest)
-    space = ReversedFeatures(
-        params.network,
-        order,
-        jnp.mean(active, 0),
-        2.0 * math.sqrt(n_active) * spread,
-        x_scale,
-        restoration,
-    )
-    return space, weights
-
-
-def train_space(config: Any, keys: Any, x: np.ndarray, y: np.ndarray) -> ReversedFeatures:
-    """Spaces of all seeds of a search, one program mapped over them.
-
-    Trained in float32; the space comes back in float64, in which the RevNet inverts to 1e-12.
-    """
-    restore = config.method == "rev_argate_bnn"
-    settings = config.rev_argate or RevArgateConfig()
-    data = jax.random.key_data(keys)
-    with jax.enable_x64(False):
-        raw = jax.random.wrap_key_data(jnp.asarray(np.asarray(data)))
-        spaces = _train(
-            settings,
-            config.task,
-            config.embedding_dim,
-            restore,
-            raw,
-            jnp.asarray(x, jnp.float32),
-            jnp.asarray(y, jnp.float32),
-        )
-
-    def widen(leaf: Any) -> Any:
-        leaf = np.asarray(leaf)
-        return jnp.asarray(leaf.astype(np.float64) if leaf.dtype == np.float32 else leaf)
-
-    return jax.tree.map(widen, spaces)
-
-
-def _train_all(
-    settings: RevArgateConfig,
-    task: Task,
-    n_active: int,
-    restore: bool,
-    keys: Array,
-    x: Array,
-    y: Array,
-) -> ReversedFeatures:
-    def one(args: tuple[Array, Array, Array]) -> ReversedFeatures:
-        return make_space(args[0], settings, task, n_active, restore, args[1], args[2])[0]
-
-    return jax.lax.map(one, (keys, x, y))
-
-
-_train = jax.jit(_train_all, static_argnums=(0, 1, 2, 3))

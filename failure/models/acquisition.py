@@ -52,12 +52,16 @@ class AcquisitionConfig:
     def __post_init__(self) -> None:
         """Refuse unknown names and a batch for acquisitions that have one maximum."""
         if self.name not in ACQUISITIONS:
-            raise ValueError(f"acquisition={self.name!r}: expected one of {ACQUISITIONS}")
+            raise ValueError(f"name={self.name!r}: expected one of {', '.join(ACQUISITIONS)}")
         if self.batch_size < 1 or (self.batch_size > 1 and self.name != "pbo"):
             raise ValueError(
-                f"batch_size={self.batch_size} with {self.name!r}: expected 1; only 'pbo' has a "
+                f"batch_size={self.batch_size}: expected 1 with {self.name!r}; only 'pbo' has a "
                 "family of acquisition functions to fill a batch"
             )
+        if not (math.isfinite(self.beta) and self.beta >= 0.0):
+            raise ValueError(f"beta={self.beta}: expected a number of at least 0")
+        if self.max_evals < 1:
+            raise ValueError(f"max_evals={self.max_evals}: expected at least 1")
         if not 1 <= self.n_restarts <= self.n_raw:
             raise ValueError(
                 f"n_restarts={self.n_restarts}: expected 1 ... n_raw={self.n_raw}; lower it"
@@ -172,15 +176,15 @@ def acquisition_value(
 
 
 def raw_points(
-    domain: Domain, centres: Float[Array, "c d"], key: Key[Array, ""], n_raw: int
+    domain: Domain, centres: Float[Array, "c d"], n_raw: int, *, key: Key[Array, ""]
 ) -> Float[Array, "r d"]:
     """Candidate starts: uniform points, and the best inputs with some coordinates drawn afresh.
 
     Args:
         domain: where to look.
         centres: the best inputs so far.
-        key: random key.
         n_raw: how many; half of them around the centres.
+        key: random key.
 
     Returns:
         The points, inside the domain.
@@ -189,7 +193,7 @@ def raw_points(
     Eriksson et al. (2019), Section 3.1.
     """
     key_fresh, key_mask, key_reach = jax.random.split(key, 3)
-    fresh = sample(domain, key_fresh, n_raw)
+    fresh = sample(domain, n_raw, key=key_fresh)
     n_local = n_raw // 2
     centre = jnp.tile(centres, (-(-n_local // centres.shape[0]), 1))[:n_local]
     chosen = jax.random.bernoulli(key_mask, min(1.0, 20.0 / fresh.shape[1]), centre.shape)

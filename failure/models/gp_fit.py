@@ -9,19 +9,18 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
-from failure.models.gp import (
+from failure.models.kernels import (
     GPConfig,
     GPParams,
-    _covariance,
-    _gram_of_lower,
-    _inverse_factor,
-    _mask,
-    _noise,
-    _profile,
-    _squared_distance,
     kernel_matrix,
+    noise_variance,
+    noisy_covariance,
+    profile,
+    row_mask,
+    squared_distance,
 )
 from failure.models.optimize import bfgs, box
+from failure.models.triangular import gram_of_lower, inverse_factor
 
 __all__ = [
     "FitResult",
@@ -74,9 +73,9 @@ def log_marginal_likelihood(
 
     with :math:`K_y = K + \sigma^2 I`. Source: Rasmussen and Williams (2006), Equation 2.30.
     """
-    mask = _mask(x, n)
+    mask = row_mask(x, n)
     k = kernel_matrix(config, params, x, x)
-    linv, log_det = _inverse_factor(_covariance(k, _noise(config, params), mask))
+    linv, log_det = inverse_factor(noisy_covariance(k, noise_variance(config, params), mask))
     white = linv @ ((y - params.mean) * mask)
     return -0.5 * (white @ white + log_det + jnp.sum(mask) * _LOG_2PI)
 
@@ -92,7 +91,7 @@ def log_prior(config: GPConfig, params: GPParams) -> Float[Array, ""]:
     loc, scale = config.lengthscale_prior
     lengthscale = jnp.exp(params.log_lengthscale)
     log_p = jnp.sum(_log_normal(lengthscale, loc + 0.5 * math.log(dim), scale))
-    return log_p + _log_normal(_noise(config, params), *config.noise_prior)
+    return log_p + _log_normal(noise_variance(config, params), *config.noise_prior)
 
 
 def map_objective(
@@ -139,21 +138,21 @@ def map_value_and_grad(
     dim = x.shape[1]
     count = n.astype(x.dtype)
     params = GPParams(theta[:dim], theta[dim], jnp.zeros((), x.dtype))
-    mask = _mask(x, n)
-    noise = _noise(config, params)
+    mask = row_mask(x, n)
+    noise = noise_variance(config, params)
     s = x * jnp.exp(-params.log_lengthscale)[None, :]
     if config.kernel == "linear":
         k = s @ s.T
         slope = jnp.ones_like(k)
     else:
-        k, slope = _profile(config.kernel, _squared_distance(s, s))
-    linv, log_det = _inverse_factor(_covariance(k, noise, mask))
+        k, slope = profile(config.kernel, squared_distance(s, s))
+    linv, log_det = inverse_factor(noisy_covariance(k, noise, mask))
     white_one, white_y = linv @ mask, linv @ (y * mask)
     mean = (white_one @ white_y) / (white_one @ white_one)
     white = white_y - mean * white_one
     alpha = white @ linv
     log_p = -0.5 * (white @ white + log_det + count * _LOG_2PI)
-    inner = alpha[:, None] * alpha[None, :] - _gram_of_lower(linv)
+    inner = alpha[:, None] * alpha[None, :] - gram_of_lower(linv)
     weight = inner * slope * (mask[:, None] * mask[None, :])
     weighted = jnp.sum(s * (weight @ s), 0)
     if config.kernel == "linear":
@@ -170,10 +169,10 @@ def map_value_and_grad(
 
 def fit(
     config: GPConfig,
+    start: GPParams,
     x: Float[Array, "n d"],
     y: Float[Array, " n"],
     n: Int[Array, ""],
-    start: GPParams,
     hessian_inverse: Float[Array, "d1 d1"] | None = None,
     fresh: Bool[Array, ""] | None = None,
     *,
@@ -185,10 +184,10 @@ def fit(
 
     Args:
         config: kernel and priors.
+        start: parameters of the last fit, or `initial_params`.
         x: inputs, padded.
         y: standardised outputs, padded.
         n: rows in use.
-        start: parameters of the last fit, or `initial_params`.
         hessian_inverse: of the last fit; two or three evaluations then often do.
         fresh: see `failure.models.optimize.bfgs`.
         max_evals: evaluations at most.

@@ -69,7 +69,7 @@ def project(domain: Domain, x: Float[Array, " d"]) -> Float[Array, " d"]:
     return x * jnp.where(bounded, shrink, jnp.ones_like(norm))
 
 
-def sample(domain: Domain, key: Key[Array, ""], n: int) -> Float[Array, "n d"]:
+def sample(domain: Domain, n: int, *, key: Key[Array, ""]) -> Float[Array, "n d"]:
     """Uniform points of the box, or of the ball where its radius is finite."""
     dim = domain.lower.shape[0]
     key_box, key_ball, key_radius = jax.random.split(key, 3)

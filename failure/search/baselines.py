@@ -9,7 +9,7 @@ import math
 
 import numpy as np
 
-from failure.search.spaces import Task
+from failure.search.task import Task
 
 __all__ = ["gradient_corner", "monte_carlo", "ridge", "ridge_corner", "uniform", "worst_corner"]
 
@@ -83,6 +83,12 @@ def ridge_corner(rng: np.random.Generator, task: Task, x: np.ndarray, y: np.ndar
     return corner[None]
 
 
+def _differences(centre: np.ndarray, step: float) -> np.ndarray:
+    """A point and its neighbours along every axis, `[D + 1, D]`; inwards, to stay in the set."""
+    sign = np.where(centre > 0, -1.0, 1.0)
+    return np.concatenate([centre[None], centre[None] + np.diag(step * sign)])
+
+
 def gradient_corner(
     rng: np.random.Generator, task: Task, x: np.ndarray, y: np.ndarray, n_left: int
 ) -> np.ndarray:
@@ -106,6 +112,9 @@ def gradient_corner(
     step = 0.05 * task.size * (1.0 if task.kind == "box" else math.sqrt(3.0 / (dim + 2.0)))
     cycle = dim + 2
     done, position = divmod(len(y), cycle)
+    if 0 < position <= dim:
+        # A smaller budget cut the block; the rest of the same differences.
+        return _differences(x[done * cycle], step)[position:][:n_left]
     if position == dim + 1:
         rows = slice(done * cycle, done * cycle + dim + 1)
         slope = (y[rows][1:] - y[rows][0]) / (x[rows][1:] - x[rows][0]).sum(1)
@@ -116,7 +125,4 @@ def gradient_corner(
         known = x[: done * cycle : cycle]
         if np.any(np.all(np.abs(known - centre) < 1e-9, axis=1)):
             centre = uniform(rng, task, 1)[0]
-    # Step inwards, so that a corner's differences stay in the set.
-    sign = np.where(centre > 0, -1.0, 1.0)
-    block = np.concatenate([centre[None], centre[None] + np.diag(step * sign)])
-    return block[:n_left]
+    return _differences(centre, step)[:n_left]

@@ -30,16 +30,10 @@ from failure.search.history import (
     first_hit,
     init,
 )
-from failure.search.spaces import (
-    FullSpace,
-    decode,
-    encode,
-    initial_design,
-    random_embedding,
-    search_domain,
-    task_domain,
-    unit_scale,
-)
+from failure.search.spaces import FullSpace, initial_design, random_embedding
+from failure.search.subspace import train_subspace
+from failure.search.task import task_domain, unit_scale
+from failure.status import Status
 
 __all__ = [
     "METHODS",
@@ -79,11 +73,11 @@ def _programs(
     def mapped(f: Callable[..., Any]) -> Any:
         return jax.jit(lambda *args: jax.lax.map(lambda a: f(*a), args))
 
-    def fit(x: Any, y: Any, n: Any, params: Any, h: Any, fresh: Any) -> Any:
-        return gp_fit.fit(gp_config, x, y, n, params, h, fresh, ftol=FIT_FTOL)
+    def fit(params: Any, x: Any, y: Any, n: Any, h: Any, fresh: Any) -> Any:
+        return gp_fit.fit(gp_config, params, x, y, n, h, fresh, ftol=FIT_FTOL)
 
     def raw(domain: Domain, centres: Any, key: Any) -> Any:
-        return acquisition.raw_points(domain, centres, key, acq.n_raw)
+        return acquisition.raw_points(domain, centres, acq.n_raw, key=key)
 
     return {
         "fit": mapped(fit),
@@ -98,12 +92,12 @@ def _programs(
 @jax.jit
 def _decode(space: Any, domain: Domain, u: Any) -> Any:
     """`u [S, q, d]` to `(x [S, q, D], clipped [S, q])`."""
-    return jax.vmap(lambda s, block: jax.vmap(partial(decode, s, domain))(block))(space, u)
+    return jax.vmap(lambda s, block: jax.vmap(partial(s.decode, domain))(block))(space, u)
 
 
 @jax.jit
 def _encode(space: Any, x: Any) -> Any:
-    return jax.vmap(lambda s, block: jax.vmap(partial(encode, s))(block))(space, x)
+    return jax.vmap(lambda s, block: jax.vmap(s.encode)(block))(space, x)
 
 
 def _stack(tree: Any, count: int) -> Any:
@@ -119,7 +113,7 @@ def _first_space(config: SearchConfig) -> Any:
         dim = config.embedding_dim or 1
         # 2**31 - 1: a stream of its own, away from the iterations'.
         keys = [jax.random.fold_in(jax.random.key(s), 2**31 - 1) for s in config.seeds]
-        spaces = [random_embedding(key, config.task, dim) for key in keys]
+        spaces = [random_embedding(config.task, dim, key=key) for key in keys]
         return jax.tree.map(lambda *leaves: jnp.stack(leaves), *spaces)
     return None
 
@@ -132,7 +126,7 @@ def _initial(config: SearchConfig, state: SearchState) -> SearchState:
     if space is None:
         drawn_from = _stack(FullSpace(jnp.asarray(unit_scale(config.task))), len(config.seeds))
     one = jax.tree.map(lambda leaf: leaf[0], drawn_from)
-    u = jax.vmap(lambda key: initial_design(one, config.task, key, config.n_init))(keys)
+    u = jax.vmap(lambda key: initial_design(one, config.task, config.n_init, key=key))(keys)
     x, clipped = _decode(drawn_from, task_domain(config.task), u)
     pending = (np.asarray(x), np.asarray(u), np.asarray(clipped))
     return state._replace(pending=pending, space=space)
@@ -171,7 +165,7 @@ def _targets(state: SearchState, size: int) -> tuple[np.ndarray, np.ndarray]:
             continue
         mean = values[good].mean()
         sd = values[good].std(ddof=1) if good.sum() > 1 else 0.0
-        sd = sd if sd > 1e-12 * (1.0 + abs(mean)) else 1.0
+        sd = sd if sd > 1e-12 * abs(mean) else 1.0
         y[row, : state.n] = np.where(good, (values - mean) / sd, 0.0)
         best[row] = y[row, : state.n][good].max()
     return y, best
@@ -187,10 +181,10 @@ def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
     if old is None or bisect_left(COLD_CHECKS, old.n_fit) != bisect_left(COLD_CHECKS, state.n):
         start = _stack(gp_fit.initial_params(config.gp, dim), seeds)
         eye = _stack(jnp.eye(dim + 1), seeds)
-        result = fit(x, y, count, start, eye, jnp.ones((seeds,), bool))
+        result = fit(start, x, y, count, eye, jnp.ones((seeds,), bool))
     if old is not None:
         cold_start = jnp.zeros((seeds,), bool)
-        warm = fit(x, y, count, old.params, old.hessian_inverse, cold_start)
+        warm = fit(old.params, x, y, count, old.hessian_inverse, cold_start)
         if result is None:
             result = warm
         else:
@@ -249,13 +243,15 @@ def _surrogate_ask(config: SearchConfig, state: SearchState) -> SearchState:
 
 def _unit_domain(config: SearchConfig, state: SearchState) -> Domain:
     space = jax.tree.map(lambda leaf: leaf[0], state.space)
-    return search_domain(space, config.task)
+    return space.domain(config.task)
 
 
 def _learn_space(config: SearchConfig, state: SearchState, train: TrainSpace | None) -> SearchState:
-    """Train Rev-ARGate on all evaluations so far; its features re-describe the whole history."""
-    if train is None:
-        from failure.rev_argate import train_space
+    """Make the space from all evaluations so far; it re-describes the whole history."""
+    if train is None and METHODS[config.method].space == "active":
+        train = train_subspace
+    elif train is None:
+        from failure.reversed_space import train_space
 
         train = train_space
     keys = _keys(config, state.n)
@@ -297,7 +293,8 @@ def ask(
     Args:
         config: the search.
         state: history; points that are already asked are returned again.
-        train: how Rev-ARGate spaces are trained; `failure.rev_argate.train_space` without.
+        train: how a learned space is made; `failure.reversed_space.train_space` without, for
+            `active_subspace` `failure.search.subspace.train_subspace`.
 
     Returns:
         `(x [S, q, D] in sigma, state)`.
@@ -309,7 +306,8 @@ def ask(
         return state.pending[0], state
     if state.n >= config.n_total:
         raise ValueError(
-            f"all {config.n_total} simulations are spent; raise n_total for a longer search"
+            f"n_total={config.n_total}: expected more than the {state.n} simulations that are "
+            "spent; raise n_total for a longer search"
         )
     method = METHODS[config.method]
     with jax.enable_x64(True):
@@ -318,7 +316,7 @@ def ask(
         elif state.n == 0:
             state = _initial(config, state)
         else:
-            if method.space in ("zeros", "bnn"):
+            if method.learned:
                 due = config.retrain_every and state.n - state.space_at >= config.retrain_every
                 if state.space is None or due:
                     state = _learn_space(config, state, train)
@@ -336,7 +334,7 @@ def tell(
         config: the search.
         state: with pending points `[S, q, D]`.
         y: `[S, q]`, larger is worse; a value that is not finite counts as invalid.
-        status: `[S, q]`, 0 where valid; all zero without.
+        status: `[S, q]`, see `failure.Status`, 0 where valid; all zero without.
 
     Raises:
         ValueError: nothing was asked, or the shape is another.
@@ -346,9 +344,9 @@ def tell(
     x, u, clipped = state.pending
     y = np.asarray(y, np.float64)
     if y.shape != x.shape[:2]:
-        raise ValueError(f"y has shape {y.shape}: expected {x.shape[:2]}, one value per point")
+        raise ValueError(f"y.shape={y.shape}: expected {x.shape[:2]}, one value per point")
     flags = np.zeros(y.shape, np.int64) if status is None else np.asarray(status, np.int64)
-    flags = np.where((flags == 0) & ~np.isfinite(y), -1, flags)
+    flags = np.where((flags == 0) & ~np.isfinite(y), Status.NOT_FINITE_OUTPUT, flags)
     y = np.where(flags == 0, y, np.nan)
     old_u = state.u if state.n else np.zeros((*u.shape[:1], 0, u.shape[2]))
     return state._replace(

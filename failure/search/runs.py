@@ -2,35 +2,65 @@
 
 from __future__ import annotations
 
-import dataclasses
-import json
 import math
-import os
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 import jax
-import jax.numpy as jnp
 import numpy as np
 
-from failure.bnn import BNNParams
 from failure.models.gp import GPParams
-from failure.revnet import RevNetParams
-from failure.search import bayesopt
+from failure.search import bayesopt, storage
 from failure.search.bayesopt import SearchConfig, SearchState, Surrogate
-from failure.search.spaces import ReversedFeatures
+from failure.search.storage import identity_of, samples
+from failure.search.task import sign_of
+from failure.status import Status
 
-__all__ = ["evaluate", "load", "run", "start_from"]
+__all__ = ["Evaluated", "evaluate", "identity_of", "load", "run", "samples", "start_from"]
 
 # x [n, D] -> (specs [n, m], status [n]); 0 is a valid sample
 Simulate = Callable[[np.ndarray], tuple[Any, Any]]
 
 
+class Evaluated(NamedTuple):
+    """Answers of a simulator.
+
+    Attributes:
+        y: `[S, q]`, larger is worse, NaN where invalid.
+        status: `[S, q]`, see `failure.Status`.
+        messages: what went wrong, by the number of the point (seed by seed).
+    """
+
+    y: np.ndarray
+    status: np.ndarray
+    messages: dict[int, str]
+
+
+def _answer(simulate: Simulate, column: int, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+    """One call of the simulator, its shapes checked: `(values [n], status [n])`."""
+    specs, flags = simulate(x)
+    specs, flags = np.asarray(specs, np.float64), np.asarray(flags, np.int64)
+    if specs.ndim != 2 or len(specs) != len(x) or flags.shape != (len(x),):
+        raise ValueError(
+            f"simulate: specs.shape={specs.shape}, status.shape={flags.shape}: expected "
+            f"({len(x)}, m) and ({len(x)},), one row per point; return them in the order of x"
+        )
+    if not 0 <= column < specs.shape[1]:
+        raise ValueError(
+            f"column={column}: expected 0 ... {specs.shape[1] - 1}, a specification of the "
+            "simulator"
+        )
+    return specs[:, column], flags
+
+
 def evaluate(
     simulate: Simulate, column: int, x: np.ndarray, *, sense: str = "max", retries: int = 1
-) -> tuple[np.ndarray, np.ndarray]:
+) -> Evaluated:
     """Simulate the points of all seeds in one batch; try failed ones again; never raise for them.
+
+    A simulator that raises on a batch is asked point by point, so that the other points keep
+    their results.
 
     Args:
         simulate: `x [n, D] -> (specs [n, m], status [n])`.
@@ -40,33 +70,50 @@ def evaluate(
         retries: further attempts at points whose simulation failed.
 
     Returns:
-        `(y [S, q], larger is worse, NaN where invalid; status [S, q])`.
+        Evaluated.
+
+    Raises:
+        ValueError: another sense; specifications or statuses of the wrong shape; no such column.
     """
+    sign = sign_of(sense)
     flat = np.asarray(x).reshape(-1, x.shape[-1])
-    y, status = np.full(len(flat), np.nan), np.ones(len(flat), np.int64)
+    y, status = np.full(len(flat), np.nan), np.full(len(flat), int(Status.FAILED))
+    messages: dict[int, str] = {}
+
+    def ask(rows: np.ndarray) -> None:
+        try:
+            values, flags = _answer(simulate, column, flat[rows])
+        except (RuntimeError, OSError, ArithmeticError) as error:
+            if len(rows) > 1:
+                for row in rows:
+                    ask(np.asarray([row]))
+            else:
+                messages[int(rows[0])] = f"{type(error).__name__}: {error}"
+            return
+        y[rows] = sign * values
+        bad = (flags == 0) & ~np.isfinite(values)
+        status[rows] = np.where(bad, int(Status.NOT_FINITE_OUTPUT), flags)
+        told = getattr(simulate, "messages", None) or {}
+        for k, row in enumerate(rows):
+            messages.pop(int(row), None)
+            if status[row] != 0 and k in told:
+                messages[int(row)] = str(told[k])
+
     left = np.arange(len(flat))
     for _ in range(retries + 1):
-        try:
-            specs, flags = simulate(flat[left])
-            values = np.asarray(specs, np.float64)[:, column]
-            flags = np.asarray(flags, np.int64)
-        except (RuntimeError, OSError, ArithmeticError):
-            # The simulator broke on the batch; each point keeps its failed status.
-            continue
-        y[left] = values if sense == "max" else -values
-        status[left] = np.where((flags == 0) & ~np.isfinite(values), -1, flags)
+        ask(left)
         left = left[status[left] != 0]
         if left.size == 0:
             break
     y[status != 0] = np.nan
-    return y.reshape(x.shape[:2]), status.reshape(x.shape[:2])
+    return Evaluated(y.reshape(x.shape[:2]), status.reshape(x.shape[:2]), messages)
 
 
 def start_from(config: SearchConfig, x: np.ndarray, y: np.ndarray) -> SearchState:
     """A history made of the user's own initial data, the same for every seed.
 
     Args:
-        config: a search in the full space or a Rev-ARGate one, or a baseline.
+        config: a search in the full space or a learned one, or a baseline.
         x: `[n, D]` in sigma.
         y: `[n]`, larger is worse.
 
@@ -83,7 +130,10 @@ def start_from(config: SearchConfig, x: np.ndarray, y: np.ndarray) -> SearchStat
     if len(y) < 2:
         raise ValueError(f"initial data of {len(y)} rows: expected at least 2")
     if bayesopt.METHODS[config.method].space == "random":
-        raise ValueError("a random embedding cannot start from given points; use method 'full'")
+        raise ValueError(
+            f"method={config.method!r}: expected one whose points have coordinates, a random "
+            "embedding cannot start from given points; use method 'full'"
+        )
     for row in range(len(y)):
         if not (np.all(np.isfinite(x[row])) and math.isfinite(y[row])):
             raise ValueError(f"initial data, row {row}: not finite; drop it or simulate it again")
@@ -104,93 +154,11 @@ def start_from(config: SearchConfig, x: np.ndarray, y: np.ndarray) -> SearchStat
     return bayesopt.describe(config, state)
 
 
-def _settings(config: SearchConfig) -> dict[str, Any]:
-    """The settings as JSON gives them back."""
-    settings: dict[str, Any] = json.loads(json.dumps(dataclasses.asdict(config)))
-    settings["task"] = config.task._asdict()
-    return settings
-
-
-def _write(path: Path, write: Callable[[Any], None]) -> None:
-    """Replace a file in one step, so that a kill leaves the old or the new one."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
-
-
-def _claim(folder: Path, config: SearchConfig) -> None:
-    """Write the settings of a new run, or check those of the one to resume."""
-    path = folder / "search.json"
-    wanted = _settings(config)
-    if path.exists():
-        held = json.loads(path.read_text(encoding="utf-8"))
-        names = sorted(k for k in {*held, *wanted} if held.get(k) != wanted.get(k))
-        if names:
-            changes = "; ".join(f"{k}: {held.get(k)!r} -> {wanted.get(k)!r}" for k in names)
-            raise ValueError(
-                f"{folder} holds a search with other settings ({changes}); resume with the same "
-                "settings or choose another folder"
-            )
-        return
-    folder.mkdir(parents=True, exist_ok=True)
-    _write(path, lambda file: file.write((json.dumps(wanted, indent=1) + "\n").encode()))
-
-
-def _append(folder: Path, state: SearchState, count: int) -> None:
-    """Log the last `count` evaluations; one line, flushed to the disk."""
-    rows = slice(state.n - count, state.n)
-    line = {
-        "n": state.n - count,
-        "x": state.x[:, rows].tolist(),
-        "u": state.u[:, rows].tolist(),
-        "y": [[v if math.isfinite(v) else None for v in seed] for seed in state.y[:, rows]],
-        "status": state.status[:, rows].tolist(),
-        "clipped": state.clipped[:, rows].tolist(),
-    }
-    with (folder / "evaluations.jsonl").open("a", encoding="utf-8") as file:
-        file.write(json.dumps(line, allow_nan=False) + "\n")
-        file.flush()
-        os.fsync(file.fileno())
-
-
-def _save_arrays(path: Path, tree: Any, at: int) -> None:
-    leaves = [np.asarray(leaf) for leaf in jax.tree.leaves(tree)]
-    arrays: dict[str, Any] = {f"leaf{i}": leaf for i, leaf in enumerate(leaves)}
-    _write(path, lambda file: np.savez(file, at=np.asarray(at), **arrays))
-
-
-def _load_arrays(path: Path) -> tuple[list[Any], int]:
-    with np.load(path) as data:
-        leaves = [jnp.asarray(data[f"leaf{i}"]) for i in range(len(data.files) - 1)]
-        return leaves, int(data["at"])
-
-
-def _space_of(leaves: list[Any]) -> ReversedFeatures:
-    """Rebuild a Rev-ARGate space from its leaves; fewer of them mean zeros for the rest."""
-    network = RevNetParams(*leaves[:5])
-    order, shift, scale, x_scale = leaves[5:9]
-    rest = leaves[9:]
-    restoration = None
-    if rest:
-        w1, b1, w2, b2, s1, c1, s2, c2 = rest[:8]
-        restoration = BNNParams((w1, b1, w2, b2), (s1, c1, s2, c2), *rest[8:])
-    return ReversedFeatures(network, order, shift, scale, x_scale, restoration)
-
-
-def load(config: SearchConfig, folder: Path) -> SearchState:
-    """The state of an interrupted run, from its folder; an empty one when there is no log yet.
-
-    A last line that a kill has torn is dropped: its evaluation was never used.
-    """
+def load(config: SearchConfig, folder: Path | str, mark: str | None = None) -> SearchState:
+    """The state of an interrupted run, from its folder; an empty one when there is no log yet."""
+    folder = Path(folder)
     state = bayesopt.init(config)
-    path = folder / "evaluations.jsonl"
-    lines = path.read_bytes().split(b"\n") if path.exists() else []
-    if lines and lines[-1]:
-        _write(path, lambda file: file.write(b"\n".join([*lines[:-1], b""])))
-    records = [json.loads(line) for line in lines[:-1]]
+    records = storage.read_log(folder, mark)
     if not records:
         return state
 
@@ -205,16 +173,18 @@ def load(config: SearchConfig, folder: Path) -> SearchState:
             status=joined("status").astype(np.int64),
             clipped=joined("clipped"),
         )
-        if (folder / "space.npz").exists():
-            leaves, at = _load_arrays(folder / "space.npz")
-            state = state._replace(space=_space_of(leaves), space_at=at)
-        later = [r["u"] for r in records if r["n"] >= state.space_at]
-        state = bayesopt.describe(config, state, later)
-        if (folder / "surrogate.npz").exists():
-            leaves, at = _load_arrays(folder / "surrogate.npz")
-            # A space that was trained later than the surrogate makes it worthless.
-            if at >= state.space_at:
-                state = state._replace(surrogate=Surrogate(GPParams(*leaves[:3]), leaves[3], at))
+        saved = storage.load_tree(folder / "space.npz")
+        if saved is not None and saved[1] <= state.n:
+            state = state._replace(space=saved[0], space_at=saved[1])
+        method = bayesopt.METHODS[config.method]
+        # A learned space that is lost is learned again; coordinates in the old one say nothing.
+        known = not method.learned or state.space is not None
+        later = [r["u"] for r in records if known and r["n"] >= state.space_at]
+        state = bayesopt.describe(config, state, [block for block in later if np.size(block)])
+        fitted = storage.load_tree(folder / "surrogate.npz", Surrogate, {"params": GPParams})
+        # A space that was trained later than the surrogate makes it worthless.
+        if known and fitted is not None and state.space_at <= fitted[1] <= state.n:
+            state = state._replace(surrogate=fitted[0]._replace(n_fit=fitted[1]))
     return state
 
 
@@ -224,11 +194,12 @@ def run(
     column: int = 0,
     *,
     sense: str = "max",
-    folder: Path | None = None,
+    folder: Path | str | None = None,
     state: SearchState | None = None,
     retries: int = 1,
     on_step: Callable[[SearchState], None] | None = None,
     train: bayesopt.TrainSpace | None = None,
+    identity: str | None = None,
 ) -> SearchState:
     """Search until the budget is spent.
 
@@ -236,46 +207,56 @@ def run(
         config: the search.
         simulate: `x [n, D] -> (specs [n, m], status [n])`; all seeds' points come in one batch.
         column: which specification.
-        sense: "max" when larger is worse.
+        sense: "max" when larger is worse, "min" when smaller is.
         folder: where the run is written; a run that is in it goes on, without repeating a
             simulation. Nothing is written without.
-        state: a history to start from (`start_from`), for a run without a folder.
+        state: a history to start from (`start_from`); it becomes the first line of the log.
         retries: further attempts at a point whose simulation failed.
         on_step: called after every batch.
         train: see `failure.search.bayesopt.ask`.
+        identity: name of the simulator in the folder; see `identity_of`, which gives it without.
 
     Returns:
         The complete history.
 
     Raises:
-        ValueError: `folder` holds a run with other settings.
+        ValueError: `folder` holds a run with other settings, column, sense, simulator or start
+            (the budget may have grown); the simulator's answer has the wrong shape.
 
     Example:
         >>> def simulate(x):
         ...     return (x**2).sum(1, keepdims=True), np.zeros(len(x))
-        >>> from failure.search.spaces import Task
+        >>> from failure.search.task import Task
         >>> config = SearchConfig(Task("ball", 3.0, 2), "ridge_corner", n_init=4, n_total=6)
         >>> run(config, simulate).y.shape
         (1, 6)
     """
+    sign_of(sense)
+    mark = ""
     if folder is not None:
-        _claim(folder, config)
-        state = load(config, folder)
+        folder = Path(folder)
+        name = identity_of(simulate) if identity is None else identity
+        mark = storage.claim(
+            folder, config, column=column, sense=sense, simulator=name, start=state
+        )
+        start, state = state, load(config, folder, mark)
+        if start is not None and start.n and state.n == 0:
+            state = start
+            storage.append_log(folder, mark, state, state.n, {})
     elif state is None:
         state = bayesopt.init(config)
     while state.n < config.n_total:
         before = state
         x, state = bayesopt.ask(config, state, train=train)
         if folder is not None:
-            if state.space_at != before.space_at:
-                _save_arrays(folder / "space.npz", state.space, state.space_at)
+            if state.space is not None and state.space_at != before.space_at:
+                storage.save_tree(folder / "space.npz", state.space, state.space_at)
             if state.surrogate is not None and state.surrogate is not before.surrogate:
-                tree = (*state.surrogate.params, state.surrogate.hessian_inverse)
-                _save_arrays(folder / "surrogate.npz", tree, state.surrogate.n_fit)
-        y, status = evaluate(simulate, column, x, sense=sense, retries=retries)
-        state = bayesopt.tell(config, state, y, status)
+                storage.save_tree(folder / "surrogate.npz", state.surrogate, state.surrogate.n_fit)
+        found = evaluate(simulate, column, x, sense=sense, retries=retries)
+        state = bayesopt.tell(config, state, found.y, found.status)
         if folder is not None:
-            _append(folder, state, y.shape[1])
+            storage.append_log(folder, mark, state, found.y.shape[1], found.messages)
         if on_step is not None:
             on_step(state)
     return state

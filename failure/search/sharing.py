@@ -14,6 +14,7 @@ from typing import Any, TypeVar
 import numpy as np
 
 from failure.search.runs import Simulate
+from failure.search.storage import identity_of
 
 __all__ = ["side_by_side"]
 
@@ -23,12 +24,13 @@ T = TypeVar("T")
 class _Exchange:
     """Requests of the searches that are still running; a round is full when all of them wait."""
 
-    def __init__(self, running: int) -> None:
+    def __init__(self, running: int, identity: str) -> None:
+        self.identity = identity
         self.changed = threading.Condition()
         self.running = running
         self.waiting: list[tuple[np.ndarray, Future[Any]]] = []
 
-    def simulate(self, x: Any) -> tuple[Any, Any]:
+    def __call__(self, x: Any) -> tuple[Any, Any]:
         """Hand in points and wait for the common batch (called by a search)."""
         answer: Future[Any] = Future()
         with self.changed:
@@ -63,6 +65,11 @@ def _answer(
         specs, status = simulate(np.concatenate([x, np.repeat(x[-1:], fill, axis=0)]))
         ends = np.cumsum(rows)
         specs, status = np.asarray(specs), np.asarray(status)
+        if len(specs) < len(x) or len(status) < len(x):
+            raise ValueError(
+                f"simulate: {len(specs)} rows of specs and {len(status)} of status: expected at "
+                f"least {len(x)}, one row per point"
+            )
     except BaseException as error:
         for _, future in requests:
             future.set_exception(error)
@@ -101,11 +108,11 @@ def side_by_side(
         raise ValueError(f"multiple={multiple}: expected at least 1, the size of a batch")
     if not searches:
         return []
-    exchange = _Exchange(len(searches))
+    exchange = _Exchange(len(searches), identity_of(simulate))
 
     def work(search: Callable[[Simulate], T]) -> T:
         try:
-            return search(exchange.simulate)
+            return search(exchange)
         finally:
             exchange.leave()
 

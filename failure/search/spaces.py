@@ -2,13 +2,17 @@
 
 A surrogate works on unit coordinates `u`, in which the initial design has variance 1/12 per
 coordinate (that of a unit cube), whatever the task: then one lengthscale prior serves them all.
-`decode` maps `u` to the parameters `x` in sigma.
+A space is a tree of arrays with three methods, so an own one needs no change elsewhere:
+
+- `domain(task)`: the feasible set of `u`;
+- `decode(domain, u)`: the parameters `x` in sigma, and the share of them that was clipped;
+- `encode(x)`: the unit coordinates of given parameters.
 """
 
 from __future__ import annotations
 
 import math
-from typing import NamedTuple
+from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
 import jax.numpy as jnp
@@ -16,29 +20,49 @@ from jaxtyping import Array, Float, Key
 
 from failure import bnn, revnet
 from failure.models.optimize import Domain, ball, box, project, sample
+from failure.search.task import Task, task_domain, unit_scale
 
 __all__ = [
+    "SPACES",
+    "ActiveSubspace",
     "FullSpace",
     "RandomEmbedding",
     "ReversedFeatures",
-    "Space",
+    "SearchSpace",
     "Task",
-    "decode",
-    "encode",
     "initial_design",
     "random_embedding",
-    "search_domain",
     "task_domain",
     "unit_scale",
 ]
 
 
-class Task(NamedTuple):
-    """Where failures are looked for: `kind` "box" (half width) or "ball" (radius), in sigma."""
+@runtime_checkable
+class SearchSpace(Protocol):
+    """What a search needs of a space; every leaf is an array, so spaces of many seeds stack."""
 
-    kind: str
-    size: float
-    dim: int
+    def domain(self, task: Task) -> Domain:
+        """The feasible set of the unit coordinates."""
+
+    def decode(
+        self, domain: Domain, u: Float[Array, " d"]
+    ) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        """Parameters in `domain`, the feasible set of x, and the share that it clipped."""
+
+    def encode(self, x: Float[Array, " D"]) -> Float[Array, " d"]:
+        """Unit coordinates; ValueError where the space has no inverse."""
+
+
+def _cube(dim: int) -> Domain:
+    """The unit cube around the origin."""
+    half = jnp.full((dim,), 0.5)
+    return box(-half, half)
+
+
+def _clip(domain: Domain, raw: Array) -> tuple[Array, Array]:
+    """A point of the feasible set, and the share of coordinates that had to move."""
+    x = project(domain, raw)
+    return x, jnp.mean((jnp.abs(x - raw) > 1e-9).astype(x.dtype))
 
 
 class FullSpace(NamedTuple):
@@ -46,12 +70,45 @@ class FullSpace(NamedTuple):
 
     scale: Array
 
+    def domain(self, task: Task) -> Domain:
+        """The unit cube, or a ball for the ball."""
+        if task.kind == "ball":
+            return ball(task.dim, task.size / unit_scale(task))
+        return _cube(task.dim)
+
+    def decode(
+        self, domain: Domain, u: Float[Array, " d"]
+    ) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        """`scale u`."""
+        return _clip(domain, self.scale * u)
+
+    def encode(self, x: Float[Array, " D"]) -> Float[Array, " d"]:
+        """`x / scale`."""
+        return x / self.scale
+
 
 class RandomEmbedding(NamedTuple):
     """HDBO: `x = P(unit A z)`, `z = 2 sqrt(d) u` in `[-sqrt d, sqrt d]^d`."""
 
     matrix: Array
     unit: Array
+
+    def domain(self, task: Task) -> Domain:
+        """The unit cube."""
+        return _cube(self.matrix.shape[-1])
+
+    def decode(
+        self, domain: Domain, u: Float[Array, " d"]
+    ) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        """The clipped linear map. Source: Shim (2020), Section 4.1."""
+        z = 2.0 * math.sqrt(u.shape[0]) * u
+        return _clip(domain, self.unit * (self.matrix @ z))
+
+    def encode(self, x: Float[Array, " D"]) -> Float[Array, " d"]:
+        """A random embedding has no inverse."""
+        raise ValueError(
+            "space=RandomEmbedding: expected a space with an inverse; draw the initial design in u"
+        )
 
 
 class ReversedFeatures(NamedTuple):
@@ -73,42 +130,79 @@ class ReversedFeatures(NamedTuple):
     x_scale: Array
     restoration: bnn.BNNParams | None
 
+    def domain(self, task: Task) -> Domain:
+        """The unit cube."""
+        return _cube(self.shift.shape[-1])
 
-Space = FullSpace | RandomEmbedding | ReversedFeatures
+    def decode(
+        self, domain: Domain, u: Float[Array, " d"]
+    ) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        """Restore the inactive features and run the network backwards.
+
+        Source: Shim (2020), Section 4.4. Deviation: a restored x may leave the box (features are
+        unbounded); it is projected and the share reported.
+        """
+        active = self.shift + self.scale * u
+        n_rest = self.order.shape[0] - active.shape[0]
+        if self.restoration is None:
+            rest = jnp.zeros((n_rest,), active.dtype)
+        else:
+            rest = bnn.predict(self.restoration, active[None])[0]
+        features = jnp.zeros_like(self.order, active.dtype)
+        features = features.at[self.order].set(jnp.concatenate([active, rest]))
+        return _clip(domain, self.x_scale * revnet.inverse(self.network, features))
+
+    def encode(self, x: Float[Array, " D"]) -> Float[Array, " d"]:
+        """The active features."""
+        features = revnet.forward(self.network, x / self.x_scale)
+        return (features[self.order[: self.shift.shape[0]]] - self.shift) / self.scale
 
 
-def task_domain(task: Task) -> Domain:
-    """The feasible set of x.
+class ActiveSubspace(NamedTuple):
+    r"""The directions in which the output changes most: :math:`x = P_\Omega(c\,B u)`.
 
-    Raises:
-        ValueError: unknown kind, or a size that is not positive.
+    Attributes:
+        basis: `[D, d]`, orthonormal columns, strongest direction first.
+        scale: `c`, parameters per unit coordinate along a column.
+
+    Source: Constantine (2015), Section 3.1; made by `failure.search.subspace`.
     """
-    if task.kind not in ("box", "ball"):
-        raise ValueError(f"task={task.kind!r}: expected 'box' or 'ball'")
-    if not (task.size > 0 and math.isfinite(task.size)):
-        raise ValueError(f"task size {task.size}: expected a positive number of sigma")
-    if task.kind == "ball":
-        return ball(task.dim, task.size)
-    limit = jnp.full((task.dim,), float(task.size))
-    return box(-limit, limit)
+
+    basis: Array
+    scale: Array
+
+    def domain(self, task: Task) -> Domain:
+        """A ball for the ball; in the box a cube that reaches its corners."""
+        dim = self.basis.shape[-1]
+        if task.kind == "ball":
+            return ball(dim, task.size / unit_scale(task))
+        half = jnp.full((dim,), 0.5 * math.sqrt(task.dim))
+        return box(-half, half)
+
+    def decode(
+        self, domain: Domain, u: Float[Array, " d"]
+    ) -> tuple[Float[Array, " D"], Float[Array, ""]]:
+        """`c B u`, projected on the set."""
+        return _clip(domain, self.scale * (self.basis @ u))
+
+    def encode(self, x: Float[Array, " D"]) -> Float[Array, " d"]:
+        """Coordinates along the columns; what is across them is dropped."""
+        return (x @ self.basis) / self.scale
 
 
-def unit_scale(task: Task) -> float:
-    r"""Parameters per unit coordinate: :math:`x = c\,u` with variance 1/12 of `u`.
-
-    A coordinate of a uniform point has variance :math:`b^2/3` in a box of half width b and
-    :math:`r^2/(D+2)` in a ball of radius r.
-
-    Example:
-        >>> unit_scale(Task("box", 3.0, 60)), round(unit_scale(Task("ball", 6.0, 60)), 3)
-        (6.0, 2.64)
-    """
-    if task.kind == "box":
-        return 2.0 * task.size
-    return task.size * math.sqrt(12.0 / (task.dim + 2))
+SPACES: dict[str, tuple[Any, dict[str, Any]]] = {
+    "FullSpace": (FullSpace, {}),
+    "RandomEmbedding": (RandomEmbedding, {}),
+    "ReversedFeatures": (
+        ReversedFeatures,
+        {"network": revnet.RevNetParams, "restoration": bnn.BNNParams},
+    ),
+    "ActiveSubspace": (ActiveSubspace, {}),
+}
+"""Name -> (class, classes of its fields that are trees themselves), for reading a saved space."""
 
 
-def random_embedding(key: Key[Array, ""], task: Task, dim: int) -> RandomEmbedding:
+def random_embedding(task: Task, dim: int, *, key: Key[Array, ""]) -> RandomEmbedding:
     r"""Draw HDBO's embedding matrix, entries N(0, 1).
 
     .. math:: x = P_\Omega(b A z), \quad A \in \mathbb R^{D \times d}, \quad
@@ -128,70 +222,8 @@ def random_embedding(key: Key[Array, ""], task: Task, dim: int) -> RandomEmbeddi
     return RandomEmbedding(matrix, jnp.asarray(unit_scale(task) / 2.0, matrix.dtype))
 
 
-def search_domain(space: Space, task: Task) -> Domain:
-    """The feasible set of `u`: the unit cube, or a ball for the full space of a ball task."""
-    if isinstance(space, FullSpace) and task.kind == "ball":
-        return ball(task.dim, task.size / unit_scale(task))
-    if isinstance(space, FullSpace):
-        dim = task.dim
-    elif isinstance(space, RandomEmbedding):
-        dim = space.matrix.shape[-1]
-    else:
-        dim = space.shift.shape[-1]
-    half = jnp.full((dim,), 0.5)
-    return box(-half, half)
-
-
-def decode(
-    space: Space, domain: Domain, u: Float[Array, " d"]
-) -> tuple[Float[Array, " D"], Float[Array, ""]]:
-    """Parameters of one unit point, and the share of coordinates that the task's set clipped.
-
-    Args:
-        space: the search space.
-        domain: feasible set of x, from `task_domain`.
-        u: unit coordinates.
-
-    Returns:
-        `(x, clipped share)`; x always lies in the domain.
-
-    Source: Shim (2020), Sections 4.1 and 4.4. Deviation: a restored x may leave the box
-    (features are unbounded); it is projected and the share reported.
-    """
-    if isinstance(space, FullSpace):
-        raw = space.scale * u
-    elif isinstance(space, RandomEmbedding):
-        z = 2.0 * math.sqrt(u.shape[0]) * u
-        raw = space.unit * (space.matrix @ z)
-    else:
-        active = space.shift + space.scale * u
-        n_rest = space.order.shape[0] - active.shape[0]
-        if space.restoration is None:
-            rest = jnp.zeros((n_rest,), active.dtype)
-        else:
-            rest = bnn.predict(space.restoration, active[None])[0]
-        features = jnp.zeros_like(space.order, active.dtype)
-        features = features.at[space.order].set(jnp.concatenate([active, rest]))
-        raw = space.x_scale * revnet.inverse(space.network, features)
-    x = project(domain, raw)
-    return x, jnp.mean((jnp.abs(x - raw) > 1e-9).astype(x.dtype))
-
-
-def encode(space: Space, x: Float[Array, " D"]) -> Float[Array, " d"]:
-    """Unit coordinates of given parameters: exact for the full space, the active part else.
-
-    Raises:
-        ValueError: a random embedding, which has no inverse.
-    """
-    if isinstance(space, FullSpace):
-        return x / space.scale
-    if isinstance(space, RandomEmbedding):
-        raise ValueError("a random embedding has no inverse: draw the initial design in u")
-    dim = space.shift.shape[0]
-    features = revnet.forward(space.network, x / space.x_scale)
-    return (features[space.order[:dim]] - space.shift) / space.scale
-
-
-def initial_design(space: Space, task: Task, key: Key[Array, ""], n: int) -> Float[Array, "n d"]:
+def initial_design(
+    space: SearchSpace, task: Task, n: int, *, key: Key[Array, ""]
+) -> Float[Array, "n d"]:
     """Uniform points of the space's own domain."""
-    return sample(search_domain(space, task), key, n)
+    return sample(space.domain(task), n, key=key)

@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 
 from failure.models.optimize import project, sample
-from failure.search.spaces import Task, task_domain
+from failure.search.task import Task, sign_of, task_domain
 
 __all__ = ["Reach", "reachable"]
 
@@ -58,14 +58,17 @@ def reachable(
         seed: of the random starts.
 
     Raises:
-        ValueError: `share` is not in (0, 1).
+        ValueError: `share` is not in (0, 1), an unknown sense, no start or step.
     """
     if not 0.0 < share < 1.0:
         raise ValueError(f"share={share}: expected a number between 0 and 1")
-    sign = 1.0 if sense == "max" else -1.0
+    for name, value in (("n_starts", n_starts), ("steps", steps)):
+        if value < 1:
+            raise ValueError(f"{name}={value}: expected at least 1")
+    sign = sign_of(sense)
     with jax.enable_x64(True):
         domain = task_domain(task)
-        starts = sample(domain, jax.random.key(seed), n_starts - 1)
+        starts = sample(domain, n_starts - 1, key=jax.random.key(seed))
         x0 = jnp.concatenate([jnp.zeros((1, task.dim)), starts])
 
         def output(x: Any) -> tuple[Any, Any]:
@@ -88,12 +91,15 @@ def reachable(
             scale = rate * size * (1.0 - t / steps)
             if task.kind == "box":
                 first, second = m / (1.0 - 0.9 ** (t + 1.0)), v / (1.0 - 0.99 ** (t + 1.0))
-                move = first / (jnp.sqrt(second) + 1e-12)
+                # A floor relative to the largest slope: femtoamperes move as volts do.
+                root = jnp.sqrt(second)
+                floor = 1e-12 * jnp.max(root, axis=1, keepdims=True)
+                move = first / jnp.maximum(root, jnp.maximum(floor, 1e-150))
             else:
                 # Steps of equal size per coordinate would come to rest on the sphere where x is
                 # parallel to the gradient's signs; the gradient's own direction is wanted.
                 length = jnp.linalg.norm(m, axis=1, keepdims=True)
-                move = m * (task.dim**0.5 / (length + 1e-300**0.5))
+                move = m * (task.dim**0.5 / jnp.maximum(length, 1e-150))
             x = jax.vmap(project, (None, 0))(domain, x + scale * move)
             return (x, m, v, best_x, best_y), y
 

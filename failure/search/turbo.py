@@ -24,6 +24,18 @@ class TurboConfig:
     success_tolerance: int = 3
     failure_tolerance: int | None = None
 
+    def __post_init__(self) -> None:
+        """Refuse lengths that are out of order and tolerances below one."""
+        if not 0.0 < self.length_min <= self.length_init <= self.length_max:
+            raise ValueError(
+                f"length_init={self.length_init}: expected 0 < length_min={self.length_min} <= "
+                f"length_init <= length_max={self.length_max}"
+            )
+        for name in ("success_tolerance", "failure_tolerance"):
+            value = getattr(self, name)
+            if value is not None and value < 1:
+                raise ValueError(f"{name}={value}: expected at least 1")
+
 
 def region_length(config: TurboConfig, y: np.ndarray, n_init: int, dim: int) -> float:
     """Length of the trust region after the evaluations `y [n]`, replayed from the start.

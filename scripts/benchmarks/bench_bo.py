@@ -143,13 +143,13 @@ def compare(seed: int, config: Config, dim: int) -> dict[str, Any]:
 
         @jax.jit
         def fit(y: Any, count: Any, params: Any, h: Any, fresh: Any) -> Any:
-            return gp_fit.fit(gp_config, px, y, count, params, h, fresh)
+            return gp_fit.fit(gp_config, params, px, y, count, h, fresh)
 
         @partial(jax.jit, static_argnums=(3, 4))
         def suggest(params: Any, y: Any, key: Any, acq: Any, newton_steps: int) -> Any:
             posterior = gp.condition(gp_config, params, px, y, after)
             _, top = jax.lax.top_k(y, 4)
-            raw = acquisition.raw_points(domain, px[top], key, acq.n_raw)
+            raw = acquisition.raw_points(domain, px[top], acq.n_raw, key=key)
             return acquisition.propose(
                 gp_config, acq, posterior, domain, jnp.max(y), raw, newton_steps=newton_steps
             )

@@ -90,16 +90,20 @@ def study(config: Config, circuit: Any, column: int) -> dict[str, Any]:
     cut = len(x) // 5
     settings = dataclasses.replace(rev_argate.RevArgateConfig(), steps=config.steps)
     key, check = jax.random.split(jax.random.key(config.seed))
-    fit = jax.jit(rev_argate.fit, static_argnums=1)
-    params, _ = fit(key, settings, data[:-cut], target[:-cut], jnp.ones((len(x) - cut,)))
+    fit = jax.jit(rev_argate.fit, static_argnums=0)
+    params, _ = fit(
+        settings, rev_argate.RevArgateTrainParams(), data[:-cut], target[:-cut],
+        jnp.ones((len(x) - cut,)), key=key,
+    )  # fmt: skip
     error = rev_argate.predict(settings, params, data[-cut:]) - target[-cut:]
     found = active.activity(settings, params, data)
     nine = int(rev_argate.active_features(jnp.asarray(found.weights)[None], 0.9)[1])
     z = revnet.forward(params.network, data)
-    on_active, on_all = rev_argate.check_active(check, z, target, found.order, found.n_active)
+    on_active, on_all = rev_argate.check_active(z, target, found.order, found.n_active, key=check)
     shares = active.by_transistor(circuit.parameter_names, found.parameters)
     picture = config.out / f"active_{circuit.name}_{spec.name}.png"
-    plots.plot_shares(picture, shares, title=f"{circuit.name}: {spec.name}")
+    picture.parent.mkdir(parents=True, exist_ok=True)
+    plots.plot_shares(shares, title=f"{circuit.name}: {spec.name}").savefig(picture)
     features = [
         {
             "feature": int(k),

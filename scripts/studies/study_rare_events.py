@@ -120,13 +120,13 @@ def main(config: Config) -> dict[str, Any]:
 
             def important(k: int, points: Any, case: Problem = case) -> Any:
                 return rare_events.importance_sampling(
-                    jax.random.key(k), case.performance, case.threshold, points,
+                    case.performance, case.threshold, points, key=jax.random.key(k),
                     n=config.n_importance,
                 )  # fmt: skip
 
             def subset(k: int, case: Problem = case) -> Any:
                 return rare_events.subset_simulation(
-                    jax.random.key(k), case.performance, case.threshold, DIM,
+                    case.performance, case.threshold, DIM, key=jax.random.key(k),
                     n=config.n_subset, replicates=config.replicates,
                 )  # fmt: skip
 

@@ -104,7 +104,7 @@ def main(config: Config) -> dict[str, Any]:
 
     from failure.search.bayesopt import METHODS, SearchState, best_so_far, first_hit
     from failure.search.runs import run
-    from failure.search.spaces import Task
+    from failure.search.task import Task
     from snn_fusion_failure.commands.own_circuit import find_circuit
     from snn_fusion_failure.records import failure_runs
 

@@ -83,7 +83,8 @@ TASKS = {
     "failure.bnn": "Models of a search",
     "failure.rev_argate": "Models of a search",
     "failure.rare_events": "How likely is a failure",
-    "failure.design_points": "How likely is a failure",
+    "failure.form": "How likely is a failure",
+    "failure.status": "Circuits and simulators",
     "failure.active": "How likely is a failure",
 }
 """Where a name is defined (the longest prefix counts) -> the task that it is listed under."""

@@ -73,15 +73,14 @@ def pictures(
     from failure import plots
 
     spec = circuit.specs[column]
-    plots.plot_trend(
-        out / "trend.png",
+    trend = plots.plot_trend(
         {label: state.y},
         threshold=threshold,
         n_init=n_init,
         label=f"{spec.name} [{spec.unit}]",
     )
+    trend.savefig(out / "trend.png")
     point = state.x.reshape(-1, circuit.n_dims)[int(np.nanargmax(state.y))]
-    plots.plot_activity(
-        out / "worst.png", circuit.parameter_names, point, title="worst point [sigma]"
-    )
+    worst = plots.plot_activity(circuit.parameter_names, point, title="worst point [sigma]")
+    worst.savefig(out / "worst.png")
     return point

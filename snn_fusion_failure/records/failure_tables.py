@@ -194,7 +194,7 @@ def targets_of(config: Config, circuit: Any, column: int, task: Any, folder: Pat
         target["probability"] = cached(
             folder / "probability.json",
             lambda: subset_simulation(
-                jax.random.key(0), performance, sign * target["threshold"], task.dim,
+                performance, sign * target["threshold"], task.dim, key=jax.random.key(0),
                 n=500, replicates=4, max_levels=12,
             )._asdict(),
         )  # fmt: skip
@@ -211,7 +211,7 @@ def run_method(
     simulate: Any,
 ) -> Any:
     """All searches of one method, or what is missing of them; returns their history."""
-    from failure.search.bayesopt import SearchConfig
+    from failure.search.methods import METHODS, SearchConfig
     from failure.search.runs import run
 
     search = SearchConfig(
@@ -219,8 +219,8 @@ def run_method(
         method,
         seeds=tuple(range(config.seeds)),
         n_total=config.n_total,
-        retrain_every=config.retrain_every,
-        embedding_dim=EMBEDDING_DIM.get(config.circuit),
+        retrain_every=config.retrain_every if METHODS[method].learned else None,
+        embedding_dim=EMBEDDING_DIM.get(config.circuit) if METHODS[method].reduced else None,
     )
     sense = circuit.specs[column].sense
     return run(search, simulate, column, sense=sense, folder=folder / method)
@@ -234,7 +234,7 @@ def main(config: Config) -> dict[str, Any]:
     from failure import circuits, plots
     from failure.search.bayesopt import METHODS
     from failure.search.sharing import side_by_side
-    from failure.search.spaces import Task
+    from failure.search.task import Task
 
     circuit = circuits.get(config.circuit)
     table, title = TABLES.get(config.circuit, (config.circuit, config.circuit))
@@ -277,13 +277,13 @@ def main(config: Config) -> dict[str, Any]:
                         record_table(path, table, title, new, preset="paper")
                     bar.advance(job)
                 sign = 1.0 if spec.sense == "max" else -1.0
-                plots.plot_trend(
-                    folder / "trend.png",
+                figure = plots.plot_trend(
                     outputs,
                     threshold=sign * target["threshold"],
                     n_init=50,
                     label=f"{spec.name} [{spec.unit}]",
                 )
+                figure.savefig(folder / "trend.png")
     write_json(config.out / f"rows_{config.circuit}.json", rows)
     solved = [row["mean"] for row in rows if row["metric"] == "success_rate"]
     print_result(rows=len(rows), mean_success=sum(solved) / max(len(solved), 1))

@@ -27,7 +27,7 @@ def test_a_network_that_moves_nothing_points_at_its_own_parameter(tmp_path):
     assert found.weights[found.order[0]] == found.weights.max() > 1.01 * found.weights.min()
     shares = active.by_transistor(NAMES, found.parameters)
     assert abs(sum(shares.values()) - 1.0) < 1e-6
-    plots.plot_shares(tmp_path / "shares.png", shares, title="shares")
+    plots.plot_shares(shares, title="shares").savefig(tmp_path / "shares.png")
     assert (tmp_path / "shares.png").stat().st_size > 1000
 
 

@@ -18,7 +18,7 @@ from tests._api import Case, check
 
 N, D = 6, 2
 GP = gp.GPConfig()
-BNN = bnn.BNNConfig(hidden=3)
+BNN, BNN_TRAIN = bnn.BNNConfig(hidden=3), bnn.BNNTrainParams()
 TASK = spaces.Task("box", 3.0, 4)
 LDO_LIKE = {"polarity": 1.0, "mobility": 0.05, "early": 4e6, "overlap": 3e-10}
 
@@ -106,7 +106,7 @@ CASES = [
     ),
     *(
         Case(
-            f"gp.kernel_matrix ({kernel})",
+            f"kernels.kernel_matrix ({kernel})",
             lambda p, a, b, kernel=kernel: gp.kernel_matrix(gp.GPConfig(kernel=kernel), p, a, b),
             lambda rng: (*data(rng)[:2], rng.normal(size=(3, D))),
             (0, 1, 2),
@@ -134,27 +134,27 @@ CASES = [
     ),
     Case(
         "optimize.sample",
-        lambda k: optimize.sample(optimize.box(-jnp.ones(3), jnp.ones(3)), k, 4),
+        lambda k: optimize.sample(optimize.box(-jnp.ones(3), jnp.ones(3)), 4, key=k),
         lambda rng: (key(rng),),
         (),
         "a draw",
     ),
     Case(
-        "spaces.decode",
-        lambda u: spaces.decode(
-            spaces.random_embedding(jax.random.key(0), TASK, 2), spaces.task_domain(TASK), u
+        "spaces.random_embedding (decode)",
+        lambda u: spaces.random_embedding(TASK, 2, key=jax.random.key(0)).decode(
+            spaces.task_domain(TASK), u
         ),
         lambda rng: (rng.uniform(-0.4, 0.4, 2),),
     ),
     Case(
-        "spaces.encode",
-        lambda scale, x: spaces.encode(spaces.FullSpace(scale), x),
+        "spaces.initial_design (encode)",
+        lambda scale, x: spaces.FullSpace(scale).encode(x),
         lambda rng: (np.float64(3.5), rng.normal(size=4)),
         (0, 1),
     ),
     Case(
         "spaces.initial_design",
-        lambda k: spaces.initial_design(spaces.FullSpace(jnp.asarray(6.0)), TASK, k, 3),
+        lambda k: spaces.initial_design(spaces.FullSpace(jnp.asarray(6.0)), TASK, 3, key=k),
         lambda rng: (key(rng),),
         (),
         "a draw",
@@ -189,7 +189,9 @@ CASES = [
     Case("circuits.cycle.expm", cycle.expm, lambda rng: (0.3 * rng.normal(size=(3, 3, 2)),)),
     Case(
         "bnn.negative_elbo",
-        lambda k, x, y: bnn.negative_elbo(BNN, bnn.init(k, BNN, x, y), x, y, k),
+        lambda k, x, y: bnn.negative_elbo(
+            BNN, BNN_TRAIN, bnn.init(k, BNN, BNN_TRAIN, x, y), x, y, key=k
+        ),
         lambda rng: (key(rng), rng.normal(size=(6, 2)), rng.normal(size=(6, 3))),
         (2,),
     ),

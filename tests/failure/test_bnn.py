@@ -18,8 +18,11 @@ def nuts(golden):
 
 @pytest.fixture(scope="module")
 def fitted(nuts):
-    fit = jax.jit(bnn.fit, static_argnums=1)
-    return fit(jax.random.key(0), CONFIG, jnp.asarray(nuts["x"]), jnp.asarray(nuts["y"]))
+    fit = jax.jit(bnn.fit, static_argnums=0)
+    return fit(
+        CONFIG, bnn.BNNTrainParams(), jnp.asarray(nuts["x"]), jnp.asarray(nuts["y"]),
+        key=jax.random.key(0),
+    )  # fmt: skip
 
 
 def truth(x):
@@ -47,7 +50,7 @@ def test_mean_field_predicts_nearly_as_well_as_nuts(fitted, nuts):
 def test_samples_spread_around_the_mean_like_the_oracle_within_mean_field_limits(fitted, nuts):
     params, _ = fitted
     x = jnp.asarray(nuts["x_new"])
-    draws = bnn.sample(params, jax.random.key(1), x, 400)
+    draws = bnn.sample(params, x, 400, key=jax.random.key(1))
     assert draws.shape == (400, 40, 2)
     assert rmse(draws.mean(0), bnn.predict(params, x)) < 0.1
     # mean-field posteriors are narrower than the true one, but not collapsed
@@ -75,7 +78,7 @@ def test_conjugate_baseline_is_the_textbook_posterior():
         predicted, variance = bnn.predict_linear(posterior, jnp.asarray(x[:5]))
         np.testing.assert_allclose(predicted, phi[:5] @ mean, rtol=1e-6)
         np.testing.assert_allclose(variance, np.sum(phi[:5] @ s * phi[:5], 1), rtol=1e-6)
-        draws = bnn.sample_linear(posterior, jax.random.key(0), jnp.asarray(x[:5]), 4000)
+        draws = bnn.sample_linear(posterior, jnp.asarray(x[:5]), 4000, key=jax.random.key(0))
         np.testing.assert_allclose(draws.mean(0), predicted, atol=0.01)
         np.testing.assert_allclose(draws.std(0)[:, 0], np.sqrt(variance), rtol=0.1)
 

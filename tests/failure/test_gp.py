@@ -153,8 +153,8 @@ def test_fit_recovers_the_relevant_coordinates_and_warm_starts_cost_little():
     scaled, _, _ = gp.standardize(jnp.asarray(y), (jnp.arange(size) < n).astype(jnp.float64))
     start, eye = gp_fit.initial_params(config, dim), jnp.eye(dim + 1)
     count = jnp.asarray(n, jnp.int32)
-    cold = fit(jnp.asarray(x), scaled, count, start, eye, jnp.asarray(True))
-    warm = fit(jnp.asarray(x), scaled, count, cold.params, cold.hessian_inverse, jnp.asarray(False))
+    cold = fit(start, jnp.asarray(x), scaled, count, eye, jnp.asarray(True))
+    warm = fit(cold.params, jnp.asarray(x), scaled, count, cold.hessian_inverse, jnp.asarray(False))
     assert bool(cold.converged) and cold.n_evals > 8
     assert warm.n_evals <= 4 and warm.value >= cold.value - 1e-6
     lengthscale = np.exp(np.asarray(cold.params.log_lengthscale))
@@ -187,6 +187,10 @@ def test_standardize_ignores_padding_and_survives_constant_data():
     assert float(mean) == 2.0 and float(sd) == 1.0
     y, _, _ = gp.standardize(jnp.asarray([5.0, 5.0, 5.0, 0.0]), mask)
     np.testing.assert_allclose(y, 0.0)
+    # femtoamperes are not constant data
+    y, _, sd = gp.standardize(1e-15 * jnp.asarray([1.0, 2.0, 3.0, 99.0]), mask)
+    np.testing.assert_allclose(y, [-1.0, 0.0, 1.0, 0.0])
+    assert np.isclose(float(sd), 1e-15, rtol=1e-9)
 
 
 def test_bad_configurations():

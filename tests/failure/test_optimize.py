@@ -87,7 +87,7 @@ def test_values_that_are_not_finite_shorten_the_step():
 
 
 def test_uniform_points_of_a_ball_have_the_known_mean_radius():
-    points = sample(ball(5, 2.0), jax.random.key(0), 4000)
+    points = sample(ball(5, 2.0), 4000, key=jax.random.key(0))
     radius = np.linalg.norm(points, axis=1)
     assert radius.max() <= 2.0 + 1e-12
     # E|x| = r d / (d + 1)

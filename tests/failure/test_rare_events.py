@@ -7,6 +7,7 @@ from scipy import integrate, stats
 from failure import rare_events
 
 DIM = 60
+KEY = jax.random.key(0)
 
 
 def linear(x):
@@ -69,7 +70,7 @@ def test_importance_sampling_interval_covers_the_truth(name):
     inside, ratios = 0, []
     for run in range(100):
         result = rare_events.importance_sampling(
-            jax.random.key(run), performance, threshold, np.asarray(points), n=1000
+            performance, threshold, np.asarray(points), key=jax.random.key(run), n=1000
         )
         inside += result.lower <= truth <= result.upper
         ratios.append(result.probability / truth)
@@ -80,7 +81,7 @@ def test_importance_sampling_interval_covers_the_truth(name):
 def test_importance_sampling_misses_a_region_it_is_not_told_of():
     performance, threshold, truth, points = PROBLEMS["two regions"]
     one = rare_events.importance_sampling(
-        jax.random.key(0), performance, threshold, np.asarray(points[:1])
+        performance, threshold, np.asarray(points[:1]), key=jax.random.key(0)
     )
     assert one.upper < 0.5 * truth
 
@@ -89,14 +90,14 @@ def test_monte_carlo_interval_covers_the_truth():
     inside = 0
     for run in range(100):
         result = rare_events.monte_carlo(
-            jax.random.key(run), linear, stats.norm.isf(1e-2), DIM, n=2000, batch=2000
+            linear, stats.norm.isf(1e-2), DIM, key=jax.random.key(run), n=2000, batch=2000
         )
         inside += result.lower <= 1e-2 <= result.upper
     assert inside >= 90
 
 
 def test_monte_carlo_without_a_hit_still_bounds_the_probability():
-    result = rare_events.monte_carlo(jax.random.key(0), linear, 6.0, DIM, n=1000)
+    result = rare_events.monte_carlo(linear, 6.0, DIM, key=jax.random.key(0), n=1000)
     assert result.probability == 0.0 and result.lower == 0.0
     # the exact bound at no hit: 1 - 0.025 ** (1 / n)
     assert np.isclose(result.upper, 1 - 0.025 ** (1 / 1000))
@@ -104,7 +105,7 @@ def test_monte_carlo_without_a_hit_still_bounds_the_probability():
 
 def test_subset_simulation_of_one_in_a_billion():
     result = rare_events.subset_simulation(
-        jax.random.key(1), linear, stats.norm.isf(1e-9), DIM, n=500, replicates=5
+        linear, stats.norm.isf(1e-9), DIM, key=jax.random.key(1), n=500, replicates=5
     )
     assert result.lower <= 1e-9 <= result.upper
     assert result.upper / result.lower < 30
@@ -118,7 +119,7 @@ def test_subset_simulation_interval_covers_the_truth(name):
     performance, threshold, truth, _ = PROBLEMS[name]
     inside = 0
     for run in range(100):
-        result = rare_events.subset_simulation(jax.random.key(run), performance, threshold, DIM)
+        result = rare_events.subset_simulation(performance, threshold, DIM, key=jax.random.key(run))
         inside += result.lower <= truth <= result.upper
     assert inside >= 90
 
@@ -161,7 +162,7 @@ def test_invalid_outputs_are_no_failures_and_counted():
         return jnp.where(x[:, 1] > 0, jnp.nan, x[:, 0])
 
     result = rare_events.importance_sampling(
-        jax.random.key(0), performance, 3.0, unit(0, 3.0)[None], n=4000
+        performance, 3.0, unit(0, 3.0)[None], key=jax.random.key(0), n=4000
     )
     assert 1500 < result.n_invalid < 2500
     assert result.lower < 0.5 * stats.norm.sf(3.0) < result.upper
@@ -169,8 +170,109 @@ def test_invalid_outputs_are_no_failures_and_counted():
 
 def test_bad_input():
     with pytest.raises(ValueError, match="at least one finite failure point"):
-        rare_events.importance_sampling(jax.random.key(0), linear, 1.0, np.zeros((0, DIM)))
+        rare_events.importance_sampling(linear, 1.0, np.zeros((0, DIM)), key=KEY)
     with pytest.raises(ValueError, match="replicates=2"):
-        rare_events.subset_simulation(jax.random.key(0), linear, 1.0, DIM, replicates=2)
+        rare_events.subset_simulation(linear, 1.0, DIM, key=KEY, replicates=2)
     with pytest.raises(ValueError, match="n \\* share >= 10"):
-        rare_events.subset_simulation(jax.random.key(0), linear, 1.0, DIM, n=50)
+        rare_events.subset_simulation(linear, 1.0, DIM, key=KEY, n=50)
+
+
+def test_steps_and_ties_are_counted_not_climbed():
+    """One output in a thousand is 1, the others are 0: there is no ladder to climb."""
+
+    def flag(x):
+        return (x[:, 0] > 3.0).astype(x.dtype)
+
+    result = rare_events.subset_simulation(flag, 0.5, 10, key=KEY, n=1000, replicates=5)
+    assert result.lower <= stats.norm.sf(3.0) <= result.upper
+    rarer = rare_events.subset_simulation(
+        lambda x: (x[:, 0] > 5.0).astype(x.dtype), 0.5, 10, key=KEY, n=200, replicates=3
+    )
+    assert not rarer.known and "outputs tie" in rarer.verdict
+    assert rarer.lower <= stats.norm.sf(5.0) <= rarer.upper
+
+    def counter(x):
+        return jnp.floor(2.0 * x[:, 0])
+
+    steps = rare_events.subset_simulation(counter, 5.5, 10, key=KEY, n=1000, replicates=5)
+    assert steps.lower <= stats.norm.sf(3.0) <= steps.upper
+    flat = rare_events.subset_simulation(
+        lambda x: jnp.minimum(x[:, 0], 2.0), 3.0, 10, key=KEY, n=200, replicates=3
+    )
+    assert not flat.known and flat.lower == 0.0 and 0.0 < flat.upper < 0.1
+
+
+def test_a_simulator_that_never_answers_leaves_everything_open():
+    def nothing(x):
+        return jnp.full(x.shape[0], jnp.nan)
+
+    for result in (
+        rare_events.subset_simulation(nothing, 1.0, 5, key=KEY, n=100, replicates=3),
+        rare_events.monte_carlo(nothing, 1.0, 5, key=KEY, n=100),
+    ):
+        assert np.isnan(result.probability) and result.upper == 1.0
+        assert "invalid" in result.verdict
+
+
+def test_a_share_that_does_not_divide_the_samples_is_unbiased():
+    ratios = [
+        rare_events.subset_simulation(
+            linear, stats.norm.isf(1e-5), DIM, key=jax.random.key(k), n=1000, share=0.3,
+            replicates=10, explore=0,
+        ).probability / 1e-5
+        for k in range(2)
+    ]  # fmt: skip
+    # a third of the samples counted as 0.3 gave half of the truth
+    assert 0.7 < np.mean(ratios) < 1.5
+
+
+def test_numpy_simulators_climb_as_well():
+    def numpy_only(x):
+        return np.sort(np.asarray(x), axis=1)[:, -1]
+
+    result = rare_events.subset_simulation(numpy_only, 4.0, 5, key=KEY, n=200, replicates=3)
+    assert result.lower <= 1.0 - stats.norm.cdf(4.0) ** 5 <= result.upper
+
+
+def test_a_region_beside_the_ladder_is_reported():
+    from failure.problems import make_problem
+
+    problem = make_problem("hidden_region", 1e-6, DIM)
+    result = rare_events.subset_simulation(
+        problem.performance, problem.threshold, DIM, key=KEY, n=500, replicates=3
+    )
+    assert "fail beside the regions of the ladder" in result.verdict
+    assert result.lower <= problem.probability <= result.upper
+
+
+def test_one_effective_sample_is_no_interval():
+    """A shift that is far off: one sample carries the sum."""
+    for k in range(5):
+        result = rare_events.importance_sampling(
+            linear, 5.0, unit(0, 5.0)[None], key=jax.random.key(k), n=300
+        )
+        assert not result.known and result.lower == 0.0
+        assert stats.norm.sf(5.0) <= result.upper <= 1.0
+        assert "effective samples" in result.verdict
+
+
+@pytest.mark.parametrize("threshold", [np.nan, np.inf])
+def test_a_threshold_that_nothing_exceeds_is_refused(threshold):
+    for call in (
+        lambda: rare_events.monte_carlo(linear, threshold, DIM, key=KEY),
+        lambda: rare_events.subset_simulation(linear, threshold, DIM, key=KEY),
+        lambda: rare_events.importance_sampling(linear, threshold, unit(0, 3.0)[None], key=KEY),
+        lambda: rare_events.find_design_point(linear, threshold, DIM),
+        lambda: rare_events.design_points(linear, threshold, unit(0, 3.0)[None]),
+    ):
+        with pytest.raises(ValueError, match=f"threshold={threshold}: expected a finite number"):
+            call()
+
+
+def test_two_estimates_that_disagree_span_both():
+    one = rare_events.Estimate(1e-7, 5e-8, 2e-7, 100, 0, 50.0)
+    other = rare_events.Estimate(2e-7, 1e-7, 4e-7, 900, 0, 50.0)
+    both = rare_events.combine(one, other)
+    assert both.known and both.n_simulations == 1000
+    missed = rare_events.combine(one, other._replace(probability=1e-5, lower=5e-6, upper=2e-5))
+    assert (missed.lower, missed.upper) == (5e-8, 2e-5) and "disagree" in missed.verdict

@@ -18,6 +18,8 @@ CONFIG = rev_argate.RevArgateConfig(
     depth=2, gate_width=8, steps=250, restoration=BNNConfig(hidden=8, steps=50)
 )
 
+TRAIN = rev_argate.RevArgateTrainParams()
+
 
 def specification(x):
     """Two of six parameters matter."""
@@ -32,8 +34,8 @@ def trained():
     y = specification(x)[0][:, 0]
     scaled = jnp.asarray(x / np.sqrt(3.0), jnp.float32)
     target = jnp.asarray((y - y.mean()) / y.std(), jnp.float32)
-    fit = jax.jit(rev_argate.fit, static_argnums=1)
-    params, losses = fit(jax.random.key(0), CONFIG, scaled, target, jnp.ones(120))
+    fit = jax.jit(rev_argate.fit, static_argnums=0)
+    params, losses = fit(CONFIG, TRAIN, scaled, target, jnp.ones(120), key=jax.random.key(0))
     return params, losses, scaled, target
 
 
@@ -42,6 +44,26 @@ def test_training_explains_the_target(trained):
     assert losses[-1] < 0.3 * losses[0]
     error = rev_argate.predict(CONFIG, params, x) - y
     assert float(jnp.mean(error**2)) < 0.35
+
+
+def test_a_sweep_over_rates_and_loss_weights_compiles_once():
+    import chex
+
+    chex.clear_trace_counter()
+    small = dataclasses.replace(CONFIG, steps=2)
+    x, y = jnp.ones((8, DIM)), jnp.arange(8.0)
+
+    def fit(train):
+        return rev_argate.fit(small, train, x, y, jnp.ones(8), key=jax.random.key(0))[1][-1]
+
+    traced = jax.jit(chex.assert_max_traces(fit, n=1))
+    changed = (
+        TRAIN._replace(learning_rate=1e-3),
+        TRAIN._replace(learning_rate=1e-2),
+        TRAIN._replace(loss=TRAIN.loss._replace(alpha=5.0)),
+    )
+    losses = {float(traced(jax.tree.map(jnp.asarray, train))) for train in changed}
+    assert len(losses) == 3
 
 
 def test_weights_sum_to_one_and_rank_the_features(trained):
@@ -59,19 +81,18 @@ def test_loss_is_equation_4_6(trained):
     mask = jnp.ones(120)
     parts = {}
     for name in ("alpha", "beta", "anchor"):
-        none = LossParams(alpha=0.0, beta=0.0, tau=CONFIG.loss.tau, anchor=0.0)
-        only = dataclasses.replace(CONFIG, loss=none._replace(**{name: 1.0}))
-        total, main = rev_argate.loss(only, params, x, y, mask)
+        none = LossParams(alpha=0.0, beta=0.0, tau=TRAIN.loss.tau, anchor=0.0)
+        only = TRAIN._replace(loss=none._replace(**{name: 1.0}))
+        total, main = rev_argate.loss(CONFIG, only, params, x, y, mask)
         parts[name] = float(total - main)
         assert parts[name] > 0
-    loss = LossParams(alpha=0.5, beta=2.0, tau=CONFIG.loss.tau, anchor=3.0)
-    config = dataclasses.replace(CONFIG, loss=loss)
-    total, main = rev_argate.loss(config, params, x, y, mask)
+    train = TRAIN._replace(loss=LossParams(alpha=0.5, beta=2.0, tau=TRAIN.loss.tau, anchor=3.0))
+    total, main = rev_argate.loss(CONFIG, train, params, x, y, mask)
     expected = float(main) + 0.5 * parts["alpha"] + 2.0 * parts["beta"] + 3.0 * parts["anchor"]
     np.testing.assert_allclose(total, expected, rtol=1e-4)
     # masked rows do not count
     doubled, _ = rev_argate.loss(
-        config, params, jnp.concatenate([x, x]), jnp.concatenate([y, 99 * y]),
+        CONFIG, train, params, jnp.concatenate([x, x]), jnp.concatenate([y, 99 * y]),
         jnp.concatenate([mask, 0 * mask]),
     )  # fmt: skip
     np.testing.assert_allclose(doubled, total, rtol=1e-4)
@@ -104,5 +125,12 @@ def test_search_trains_on_counted_simulations_and_resumes(tmp_path):
 
 
 def test_bad_configuration():
-    with pytest.raises(ValueError, match="tau=0"):
-        rev_argate.RevArgateConfig(loss=LossParams(tau=0.0))
+    with pytest.raises(ValueError, match="depth=0"):
+        rev_argate.RevArgateConfig(depth=0)
+    with pytest.raises(ValueError, match="tau"):
+        LossParams(tau=0.0)
+    for name, value in (("weight_decay", -1.0), ("learning_rate", -1e-3)):
+        with pytest.raises(ValueError, match=f"{name}={value}"):
+            bayesopt.SearchConfig(
+                TASK, "rev_argate_bnn", rev_argate_training=TRAIN._replace(**{name: value})
+            )

@@ -27,6 +27,19 @@ def test_a_specification_whose_small_values_are_bad():
     assert np.isclose(reach.worst, -2.0, atol=0.01) and np.isclose(reach.threshold, -1.0, atol=0.01)
 
 
+def test_a_specification_in_femtoamperes_is_pushed_as_far():
+    def tiny(x):
+        specs, status = two_hills(x)
+        return 1e-15 * specs, status
+
+    task = Task("box", 3.0, 2)
+    np.testing.assert_allclose(
+        reachable(tiny, 1, task).worst, 1e-15 * reachable(two_hills, 1, task).worst, rtol=1e-6
+    )
+
+
 def test_bad_share():
     with pytest.raises(ValueError, match=r"share=1\.5"):
         reachable(two_hills, 0, Task("box", 3.0, 2), share=1.5)
+    with pytest.raises(ValueError, match="sense='mni'"):
+        reachable(two_hills, 0, Task("box", 3.0, 2), sense="mni")

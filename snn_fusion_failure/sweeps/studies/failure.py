@@ -66,7 +66,7 @@ def make(
         half = jnp.full((dim,), 0.5)
         cube = box(-half, half)
         scale = 2.0 * params.size
-        u = jnp.zeros((n_total, dim)).at[:n_init].set(sample(cube, key, n_init))
+        u = jnp.zeros((n_total, dim)).at[:n_init].set(sample(cube, n_init, key=key))
         y = jnp.full((n_total,), jnp.nan).at[:n_init].set(simulate(scale * u[:n_init]))
 
         def step(carry: Any, n: Any) -> Any:
@@ -76,7 +76,7 @@ def make(
             z, _, _ = gp.standardize(raw, used)
             due = (n - n_init) % refit_every == 0
             fitted = jax.lax.cond(
-                due, lambda: gp_fit.fit(config, u, z, n, fitted, max_evals=60).params,
+                due, lambda: gp_fit.fit(config, fitted, u, z, n, max_evals=60).params,
                 lambda: fitted,
             )  # fmt: skip
             posterior = gp.condition(config, fitted, u, z, n)
@@ -86,7 +86,9 @@ def make(
                 jnp.maximum(-half, u[top[0]] - reach), jnp.minimum(half, u[top[0]] + reach),
                 jnp.asarray(jnp.inf),
             )  # fmt: skip
-            points = acquisition.raw_points(local, u[top], jax.random.fold_in(key, n), candidates)
+            points = acquisition.raw_points(
+                local, u[top], candidates, key=jax.random.fold_in(key, n)
+            )
             mean, variance = gp.predict(config, posterior, points)
             value = acquisition.weighted(mean, jnp.sqrt(variance), jnp.asarray(params.weight))
             point = points[jnp.argmax(value)]

@@ -1,20 +1,19 @@
-"""The most likely points of the failure regions: where importance sampling starts."""
+"""First-order reliability: the most likely points of the failure regions."""
 
 from __future__ import annotations
 
 import math
 from collections.abc import Callable
-from typing import Any
 
 import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["Performance", "design_points", "merge_points"]
+from failure.estimates import check_threshold
+from failure.performances import Performance
 
-# x [n, D] -> y [n]
-Performance = Callable[[Any], Any]
+__all__ = ["design_points", "merge_points"]
 
 
 def merge_points(
@@ -76,7 +75,10 @@ def design_points(
 
     Source: Rackwitz and Fiessler (1978); Zhang and Der Kiureghian (1995) for the merit function.
     """
+    check_threshold(threshold)
     u = np.array(failures, np.float64)
+    if u.ndim != 2 or len(u) == 0:
+        raise ValueError(f"failures.shape={u.shape}: expected at least one point [k, D]")
     used = 0
 
     def simulate(x: np.ndarray) -> np.ndarray:
@@ -84,6 +86,10 @@ def design_points(
         used += len(x)
         with jax.enable_x64(True):
             y = np.asarray(performance(jnp.asarray(x)), np.float64)
+        if y.shape != x.shape[:1]:
+            raise ValueError(
+                f"performance: y.shape={y.shape}: expected {x.shape[:1]}, one value per row"
+            )
         return np.where(np.isfinite(y), y, -np.inf)
 
     y = simulate(u)
@@ -106,7 +112,7 @@ def design_points(
         used += len(u) if gradient is not None else 0
         norm2 = np.maximum(np.sum(slope**2, 1), 1e-300)
         target = ((np.sum(slope * u, 1) - (y - threshold)) / norm2)[:, None] * slope
-        penalty = 2.0 * np.linalg.norm(u, axis=1) / np.sqrt(norm2) + 1e-9
+        penalty = 2.0 * np.maximum(np.linalg.norm(u, axis=1), 1e-9) / np.sqrt(norm2)
 
         def merit(x: np.ndarray, gap: np.ndarray, weight: np.ndarray) -> np.ndarray:
             return 0.5 * np.sum(x**2, -1) + weight * np.abs(gap)

@@ -1,0 +1,142 @@
+"""Design points that are checked, lines from them, and all regions together."""
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+from scipy import stats
+
+from failure.hlrf import find_design_point
+from failure.lines import line_sampling, sample_lines
+from failure.performances import slopes_by_jax
+from failure.problems import make_problem
+from failure.regions import probability_by_lines
+
+DIM = 60
+KEY = jax.random.key(0)
+
+
+def test_a_design_point_by_gradient_takes_a_handful_of_evaluations():
+    problem = make_problem("bent", 1e-9, DIM)
+    found = find_design_point(
+        problem.performance, problem.threshold, DIM, slopes=slopes_by_jax(problem.performance)
+    )
+    assert found.converged and found.n_gradients <= 6 and found.n_simulations == 0
+    assert np.isclose(found.beta, problem.threshold, rtol=1e-3)
+    cosine = found.point @ problem.points[0] / problem.threshold / np.linalg.norm(found.point)
+    assert cosine > 0.999 and found.first_failure <= 5
+
+
+def test_values_alone_take_two_rounds_of_differences():
+    problem = make_problem("bent", 1e-9, DIM)
+    found = find_design_point(problem.performance, problem.threshold, DIM)
+    assert found.converged and found.n_gradients == 0
+    assert 2 * DIM < found.n_simulations < 2 * DIM + 15
+
+
+@pytest.mark.parametrize("scale", [1e-15, 1.0, 1e12])
+def test_units_do_not_matter(scale):
+    problem = make_problem("curved_manifold", 1e-6, 12)
+
+    def scaled(x):
+        return scale * problem.performance(x)
+
+    start = 0.3 * np.ones(12)
+    found = find_design_point(scaled, scale * problem.threshold, 12, start=start)
+    whole = find_design_point(problem.performance, problem.threshold, 12, start=start)
+    np.testing.assert_allclose(found.point, whole.point, rtol=1e-5, atol=1e-7)
+    assert found.verdict == whole.verdict
+
+
+def test_a_descent_that_stops_elsewhere_says_so_and_gives_no_narrow_interval():
+    def saturates(x):
+        return jnp.tanh(x[:, 0])
+
+    found = find_design_point(saturates, 1.1, DIM, slopes=slopes_by_jax(saturates))
+    assert not found.converged and "not reached" in found.verdict
+    estimate = line_sampling(saturates, 1.1, found, key=KEY)
+    assert not estimate.known and (estimate.lower, estimate.upper) == (0.0, 1.0)
+
+    flat = find_design_point(lambda x: jnp.zeros(x.shape[0]), 1.0, DIM)
+    assert "does not vary" in flat.verdict
+    invalid = find_design_point(lambda x: jnp.full(x.shape[0], jnp.nan), 1.0, DIM)
+    assert "not finite" in invalid.verdict and np.isnan(invalid.beta)
+    nominal = find_design_point(lambda x: x[:, 0], -1.0, DIM)
+    assert "nominal point fails" in nominal.verdict
+
+
+def test_lines_cover_the_truth_within_twenty_gradients():
+    problem = make_problem("bent", 1e-9, DIM)
+    slopes = slopes_by_jax(problem.performance)
+    design = find_design_point(problem.performance, problem.threshold, DIM, slopes=slopes)
+    inside, cost, within = 0, [], 0
+    for k in range(20):
+        found = line_sampling(
+            problem.performance, problem.threshold, design, key=jax.random.key(k), slopes=slopes
+        )
+        inside += found.lower <= problem.probability <= found.upper
+        within += 0.5 <= found.probability / problem.probability <= 2.0
+        cost.append(design.n_gradients + found.n_simulations)
+    assert inside >= 18 and within >= 19
+    assert np.median(cost) <= 20
+
+
+def test_lines_with_values_only():
+    problem = make_problem("bent", 1e-9, DIM)
+    design = find_design_point(problem.performance, problem.threshold, DIM)
+    found = line_sampling(problem.performance, problem.threshold, design, key=KEY)
+    assert found.known and found.lower <= problem.probability <= found.upper
+    assert found.n_simulations <= 80
+
+
+def test_a_saddle_is_seen_by_its_curvature():
+    """From nominal the descent ends between the two nearest points, where all checks hold."""
+    problem = make_problem("curved_manifold", 1e-9, DIM)
+    slopes = slopes_by_jax(problem.performance)
+    saddle = find_design_point(problem.performance, problem.threshold, DIM, slopes=slopes)
+    assert saddle.converged
+    lines = sample_lines(problem.performance, problem.threshold, saddle, key=KEY, slopes=slopes)
+    assert lines.bend > 1.0 and not lines.estimate.known
+    both = probability_by_lines(
+        problem.performance, problem.threshold, DIM, key=KEY, slopes=slopes, scan=0
+    )
+    assert len(both.points) == 2
+    assert both.estimate.lower <= problem.probability <= both.estimate.upper
+
+
+@pytest.mark.parametrize("name", ["window", "opposite_mechanisms", "hidden_region"])
+def test_all_regions_are_found_and_summed(name):
+    problem = make_problem(name, 1e-9, DIM)
+    found = probability_by_lines(
+        problem.performance, problem.threshold, DIM, key=KEY,
+        slopes=slopes_by_jax(problem.performance),
+    )  # fmt: skip
+    assert len(found.points) == len(problem.points)
+    assert found.estimate.known and np.isclose(found.shares.sum(), 1.0)
+    np.testing.assert_allclose(found.estimate.probability, problem.probability, rtol=0.02)
+
+
+def test_failures_on_a_whole_circle_are_not_called_known():
+    problem = make_problem("shell", 1e-9, DIM)
+    for slopes in (None, slopes_by_jax(problem.performance)):
+        found = probability_by_lines(
+            problem.performance, problem.threshold, DIM, key=KEY, slopes=slopes
+        )
+        assert not found.estimate.known and found.estimate.upper == 1.0
+
+
+def test_bad_requests():
+    design = find_design_point(lambda x: x[:, 0], 3.0, 4)
+    with pytest.raises(ValueError, match=r"factor=1\.0"):
+        line_sampling(lambda x: x[:, 0], 3.0, design, key=KEY, factor=1.0)
+    with pytest.raises(ValueError, match="min_lines=2"):
+        line_sampling(lambda x: x[:, 0], 3.0, design, key=KEY, min_lines=2)
+    with pytest.raises(ValueError, match=r"start.shape=\(3,\)"):
+        find_design_point(lambda x: x[:, 0], 3.0, 4, start=np.zeros(3))
+    with pytest.raises(ValueError, match=r"y.shape=\(1, 1\)"):
+        find_design_point(lambda x: np.asarray(x), 3.0, 1)
+    with pytest.raises(ValueError, match="most=0"):
+        probability_by_lines(lambda x: x[:, 0], 3.0, 4, key=KEY, most=0)
+    assert np.isclose(design.beta, 3.0) and np.isclose(
+        stats.norm.sf(design.beta), 1.35e-3, rtol=1e-3
+    )

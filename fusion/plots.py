@@ -10,6 +10,8 @@ from jax.typing import ArrayLike
 from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
+from fusion._checks import check_choice
+
 __all__ = ["plot_cases", "plot_channel_weights", "plot_confusion", "plot_gate", "plot_training"]
 
 Values = ArrayLike | Sequence[Any]
@@ -81,7 +83,9 @@ def plot_confusion(
     counts = np.asarray(matrix)
     c = len(classes)
     if counts.shape != (c, c):
-        raise ValueError(f"matrix has shape {counts.shape}, expected ({c}, {c}) for {c} classes")
+        raise ValueError(
+            f"matrix.shape={counts.shape}: expected ({c}, {c}); give one name for each class"
+        )
     share = counts / np.maximum(counts.sum(axis=1, keepdims=True), 1)
     figure = Figure(figsize=(1.9 + 0.62 * c, 1.5 + 0.56 * c), layout="constrained")
     axes = figure.subplots()
@@ -128,7 +132,9 @@ def plot_gate(
     w, m = _weights_and_mask(weights, mask, len(channels))
     w, m = w[m.any(axis=1)], m[m.any(axis=1)]
     if not len(w):
-        raise ValueError("no example has a failed channel: there is nothing to compare")
+        raise ValueError(
+            "mask=all False: expected examples with a failed channel; there is nothing to compare"
+        )
     k = len(channels)
     figure = Figure(figsize=(2.0 + 0.62 * k, 4.4), layout="constrained")
     axes = figure.subplots()
@@ -187,10 +193,9 @@ def plot_channel_weights(
 
     Source: Shim (2020), Figure 3.7.
     """
-    if channel not in channels:
-        raise ValueError(f"channel {channel!r} is unknown, expected one of {list(channels)}")
+    check_choice("channel", channel, channels)
     if not models:
-        raise ValueError("no models given, expected at least one")
+        raise ValueError("models={}: expected at least one; give its weights and mask")
     index, k = list(channels).index(channel), len(channels)
     data = {name: _weights_and_mask(*pair, k) for name, pair in models.items()}
     top = max(float(w[m.any(axis=1), index].max(initial=1.0 / k)) for w, m in data.values())
@@ -237,7 +242,7 @@ def plot_training(curves: Mapping[str, Mapping[str, Values]], *, title: str = "T
     """
     metrics = list(dict.fromkeys(metric for by_metric in curves.values() for metric in by_metric))
     if not metrics:
-        raise ValueError("no curves given, expected at least one model with one metric")
+        raise ValueError("curves={}: expected at least one model with one metric; give its values")
     figure = Figure(figsize=(1.0 + 3.6 * len(metrics), 3.4), layout="constrained")
     panels = figure.subplots(1, len(metrics), squeeze=False)[0]
     for axes, metric in zip(panels, metrics, strict=True):
@@ -263,7 +268,8 @@ def _weights_and_mask(weights: Values, mask: Values, k: int) -> tuple[np.ndarray
     w, m = np.asarray(weights, dtype=np.float64), np.asarray(mask, dtype=bool)
     if w.ndim != 2 or w.shape[1] != k or m.shape != w.shape:
         raise ValueError(
-            f"weights have shape {w.shape} and mask {m.shape}, expected [N, {k}] for both"
+            f"weights.shape={w.shape}, mask.shape={m.shape}: expected [N, {k}] for both; give the "
+            "names of all channels"
         )
     return w, m
 

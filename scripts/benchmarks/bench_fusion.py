@@ -25,10 +25,10 @@ from typing import Any
 from snn_fusion_failure.records.rows import summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    fail,
     print_result,
     provenance,
     repository,
+    run_command,
     write_json,
 )
 
@@ -368,9 +368,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except ValueError as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

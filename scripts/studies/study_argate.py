@@ -16,15 +16,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    fail,
     print_result,
     progress,
     repository,
+    run_command,
     write_json,
 )
 
@@ -121,7 +119,9 @@ def variants(config: Config) -> list[Variant]:
     """
     unknown = [m for m in config.models if m not in GRID]
     if unknown:
-        raise ValueError(f"models {unknown} are not in the study; known: {', '.join(GRID)}")
+        raise ValueError(
+            f"models={unknown}: expected some of {', '.join(GRID)}; leave the others out"
+        )
     return [
         Variant(dataset, model, tuple(changes.items()), seed)
         for seed in range(config.seeds)
@@ -145,7 +145,7 @@ def change(settings: Any, corruption: Any, changes: dict[str, Any]) -> tuple[Any
     unknown = sorted(set(changes) - {*_MODEL, *_TERMS, *_LOSS, "redraw"})
     if unknown:
         known = ", ".join((*_MODEL, *_TERMS, *_LOSS, "redraw"))
-        raise ValueError(f"settings {unknown} are not known; known: {known}")
+        raise ValueError(f"changes={unknown}: expected some of {known}; leave the others out")
     hyper = settings.hyper
     loss = dataclasses.replace(settings.model.recipe.loss, **chosen(_TERMS))
     settings = settings._replace(
@@ -244,7 +244,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

@@ -280,9 +280,9 @@ def test_the_study_changes_one_setting_at_a_time(tmp_path: Path) -> None:
         assert (study_argate.change(*base, dict(variant.changes)) == base) == (
             not variant.changes
         ), variant
-    with pytest.raises(ValueError, match=r"\['depth'\] are not known; known: normalizer"):
+    with pytest.raises(ValueError, match=r"changes=\['depth'\]: expected some of normalizer"):
         study_argate.change(*base, {"depth": 3})
-    with pytest.raises(ValueError, match=r"\['oracle'\] are not in the study"):
+    with pytest.raises(ValueError, match=r"models=\['oracle'\]: expected some of baseline"):
         study_argate.variants(study_argate.Config(models=("oracle",)))
 
 

@@ -3,27 +3,32 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 JOBS   ?= 2
+# The versions that the suite has passed with; `make CONSTRAINTS= test` takes the newest there are.
+CONSTRAINTS ?= constraints.txt
+INSTALL := -m pip install -q --disable-pip-version-check $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
+# Of the slow tests a third, another one each day: `make slow PART=0/1` runs all of them.
+PART   ?= $(shell expr $$(date +%j) % 3)/3
 
 # Compiled programs are kept between runs: compiling is most of the time of a short one.
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
 
-.PHONY: help demo report test slow commands lint types docs wheel check clean
+.PHONY: help demo report test slow commands lint types docs wheel lowest check clean
 .DEFAULT_GOAL := help
 
 help:  ## list the commands
 	@grep -E '^[a-z-]+:.*##' $(MAKEFILE_LIST) | sed -E 's/:.*## /\t/' | expand -t 10
 
-$(VENV)/.run: pyproject.toml
+$(VENV)/.run: pyproject.toml constraints.txt
 	@echo "== installing what a run needs into $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -q --disable-pip-version-check -e .
+	@$(BIN)/python $(INSTALL) -e .
 	@touch $@
 
-$(VENV)/.dev: pyproject.toml
+$(VENV)/.dev: pyproject.toml constraints.txt
 	@echo "== installing what tests, lint and docs need into $(VENV)"
 	@test -x $(BIN)/python || $(PYTHON) -m venv $(VENV)
-	@$(BIN)/python -m pip install -q --disable-pip-version-check -e '.[dev]'
+	@$(BIN)/python $(INSTALL) -e '.[dev]'
 	@touch $@ $(VENV)/.run
 
 demo: $(VENV)/.run  ## install what a run needs and show the main job, with pictures (<= 6 min)
@@ -37,8 +42,8 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 	@echo "== running the default test suite on $(JOBS) workers"
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-slow: $(VENV)/.dev  ## the tests that take minutes each
-	$(BIN)/python -m pytest -m slow
+slow: $(VENV)/.dev  ## a third of the tests that take minutes each, another third every day
+	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
 
 commands: $(VENV)/.dev  ## run every command of README and docs at its smallest size, in a copy
 	$(BIN)/python scripts/tools/check_commands.py --jobs $(JOBS)
@@ -56,7 +61,10 @@ docs: $(VENV)/.dev  ## build the documentation into site/
 wheel: $(VENV)/.dev  ## build the wheel and import it from outside the repository
 	$(BIN)/python scripts/tools/check_wheel.py
 
-check: lint types docs wheel test commands  ## everything that CI runs but the report page
+lowest: $(VENV)/.dev  ## a few test files with the lowest allowed versions, in an environment of their own
+	$(BIN)/python scripts/tools/check_lowest.py
+
+check: lint types docs wheel test slow commands lowest  ## what CI runs, but for the report page
 
 clean:  ## remove what the other commands made, but not runs/ or results/
 	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,8 +1,10 @@
-"""Shared set-up: strict promotion, a compilation cache, the real data when it is there."""
+"""Shared set-up: strict promotion, compiled programs, parts of the slow tests, the real data."""
 
 from __future__ import annotations
 
 import contextlib
+import ctypes
+import gc
 import os
 from collections.abc import Iterator
 from pathlib import Path
@@ -19,6 +21,53 @@ GOLDEN = Path(__file__).resolve().parent / "golden"
 if not os.environ.get("JAX_COMPILATION_CACHE_DIR"):
     jax.config.update("jax_compilation_cache_dir", str(ROOT / ".cache" / "jax"))
     jax.config.update("jax_persistent_cache_min_compile_time_secs", 0.5)
+
+
+ROOM = 2 * 1024**3
+"""Resident memory [bytes] from which compiled programs are dropped between two test files."""
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--slow-part",
+        metavar="I/N",
+        help="of the tests marked slow, only every N-th, from the I-th (0 to N - 1)",
+    )
+
+
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out the slow tests of other parts; the parts are made over all collected ones."""
+    text = config.getoption("--slow-part")
+    if not text:
+        return
+    index, _, count = text.partition("/")
+    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+        raise pytest.UsageError(f"--slow-part={text}: expected I/N with I < N, such as 0/3")
+    slow = sorted({item.nodeid for item in items if item.get_closest_marker("slow")})
+    chosen = {name for i, name in enumerate(slow) if i % int(count) == int(index)}
+    left = [item for item in items if item.nodeid in {*slow} - chosen]
+    config.hook.pytest_deselected(items=left)
+    items[:] = [item for item in items if item not in left]
+
+
+def _resident() -> int:
+    """Memory of this process [bytes]; 0 where the system does not say."""
+    try:
+        pages = int(Path("/proc/self/statm").read_text(encoding="utf-8").split()[1])
+    except OSError:
+        return 0
+    return pages * os.sysconf("SC_PAGE_SIZE")
+
+
+@pytest.fixture(scope="module", autouse=True)
+def _memory() -> Iterator[None]:
+    """Compiled programs pile up over the files that a worker runs; drop them when they are many."""
+    yield
+    if _resident() > ROOM:
+        jax.clear_caches()
+        gc.collect()
+        with contextlib.suppress(OSError, AttributeError):
+            ctypes.CDLL("libc.so.6").malloc_trim(0)
 
 
 @pytest.fixture(autouse=True)

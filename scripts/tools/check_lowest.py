@@ -3,8 +3,8 @@
     python scripts/tools/check_lowest.py
     python scripts/tools/check_lowest.py --keep /tmp/lowest
 
-The versions are the lower bounds of `pyproject.toml`. Takes a few minutes, mostly for installing and
-compiling; the test files touch each dependency once.
+The versions are the lower bounds of `pyproject.toml`. Takes a few minutes, mostly for installing
+and compiling; the test files touch each dependency once.
 """
 
 from __future__ import annotations

@@ -155,6 +155,7 @@ RULES = (
     Rule("reproduce.py quick", "--seeds 1 --models S4 baseline"),
     Rule("render_results.py"),
     Rule("render_api.py"),
+    Rule("draw_architecture.py"),
     Rule("sweep.py show"),
     Rule("sweep.py lif", "--grid drive=16,40 neuron.tau_m=10 --seeds 2"),
     Rule(
@@ -303,10 +304,15 @@ def page_name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+def _text(page: Path) -> str:
+    """A page without the lines that say how a number of record was made: those are history."""
+    return re.sub(r"^Commands?: .*$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+
+
 def script_commands() -> list[tuple[str, str]]:
     """(where, command of a script) of all pages and of the scripts' docstrings, each once."""
     found: dict[str, str] = {}
-    texts = {page_name(page): page.read_text(encoding="utf-8") for page in PAGES}
+    texts = {page_name(page): _text(page) for page in PAGES}
     for path in sorted((ROOT / "scripts").rglob("*.py")):
         texts[page_name(path)] = ast.get_docstring(ast.parse(path.read_text("utf-8"))) or ""
     for where, text in texts.items():
@@ -319,7 +325,7 @@ def documented() -> list[Command]:
     """All commands of README.md and docs/, each once, in the order of the pages."""
     found: dict[str, Command] = {}
     for page in PAGES:
-        text = page.read_text(encoding="utf-8")
+        text = _text(page)
         for printed in (*commands(text, abbreviated=True), *shell_lines(text)):
             # The same words with another comment are the same command.
             key = shlex.join(words(printed))

@@ -304,9 +304,21 @@ def page_name(page: Path) -> str:
     return str(page.relative_to(ROOT))
 
 
+def _moved(match: re.Match[str]) -> str:
+    """Where a script stands now: those of older numbers of record have moved into a folder."""
+    if (ROOT / match[0]).is_file():
+        return match[0]
+    found = sorted((ROOT / "scripts").glob(f"*/{match[1]}"))
+    return str(found[0].relative_to(ROOT)) if found else match[0]
+
+
 def _text(page: Path) -> str:
-    """A page without the lines that say how a number of record was made: those are history."""
-    return re.sub(r"^Commands?: .*$", "", page.read_text(encoding="utf-8"), flags=re.MULTILINE)
+    """A page whose lines on how a number of record was made name scripts where they stand now."""
+
+    def line(match: re.Match[str]) -> str:
+        return re.sub(r"scripts/(\w+\.py)", _moved, match[0])
+
+    return re.sub(r"^Commands?: .*$", line, page.read_text("utf-8"), flags=re.MULTILINE)
 
 
 def script_commands() -> list[tuple[str, str]]:

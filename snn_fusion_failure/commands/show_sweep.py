@@ -91,10 +91,11 @@ def look(config: Show) -> dict[str, Any]:
         for leaf, (first, total) in importance(dataset).items():
             print(f"  {leaf}: {first:.2f}, {'-' if total is None else f'{total:.2f}'}")
     if config.figures and rows:
-        from snn_fusion_failure.sweeps.plots import draw
+        from snn_fusion_failure.sweeps.plots import plot_all
 
-        for path in draw(dataset, config.out):
-            print(path)
+        for name, figure in plot_all(dataset).items():
+            figure.savefig(config.out / name, dpi=120)
+            print(config.out / name)
     if config.page:
         from snn_fusion_failure.sweeps.page import write_page
 

@@ -6,33 +6,26 @@ Pictures are of the settings that are ranked; bright is better, whichever way th
 from __future__ import annotations
 
 import itertools
-from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 import numpy as np
 
 from snn_fusion_failure.sweeps.rank import axis_columns, axis_names, rank, value_text
 
-__all__ = ["draw", "plot_heat_map", "plot_parallel"]
+if TYPE_CHECKING:
+    from matplotlib.figure import Figure
+
+__all__ = ["plot_all", "plot_heat_map", "plot_parallel"]
 
 
-def draw(dataset: Any, out: Path, *, pairs: int = 6) -> list[Path]:
-    """Draw into `out`: heat maps (of a grid) and parallel coordinates. Returns the files."""
-    import matplotlib
-
-    matplotlib.use("agg")
-    import matplotlib.pyplot as plt
-
+def plot_all(dataset: Any, *, pairs: int = 6) -> dict[str, Figure]:
+    """Heat maps (of a grid, at most `pairs`) and parallel coordinates, by file name."""
     leaves = axis_names(dataset)
-    figures: dict[str, Any] = {}
+    figures: dict[str, Figure] = {}
     if "setting" not in dataset.dims and len(leaves) >= 2:
         for row, column in itertools.islice(itertools.combinations(leaves, 2), pairs):
             figures[f"heat_{row}_{column}.png"] = plot_heat_map(dataset, row, column)
-    figures["parallel.png"] = plot_parallel(dataset)
-    for name, figure in figures.items():
-        figure.savefig(out / name, dpi=120)
-        plt.close(figure)
-    return [out / name for name in figures]
+    return figures | {"parallel.png": plot_parallel(dataset)}
 
 
 def _means(dataset: Any) -> np.ndarray:
@@ -49,7 +42,7 @@ def _style(dataset: Any) -> tuple[str, str]:
     return label, "viridis" if dataset[objective].attrs["goal"] == "max" else "viridis_r"
 
 
-def plot_heat_map(dataset: Any, row: str, column: str) -> Any:
+def plot_heat_map(dataset: Any, row: str, column: str) -> Figure:
     """Mean objective over two axes of a grid; over the others it is averaged.
 
     Returns:
@@ -79,7 +72,7 @@ def plot_heat_map(dataset: Any, row: str, column: str) -> Any:
     return figure
 
 
-def plot_parallel(dataset: Any) -> Any:
+def plot_parallel(dataset: Any) -> Figure:
     """A line per setting through its values, by rank, and its objective.
 
     Returns:

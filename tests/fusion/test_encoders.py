@@ -50,7 +50,7 @@ def test_conv1d_gradients_agree_between_backends() -> None:
 
 
 def test_short_series_is_refused_with_the_length_it_needs() -> None:
-    with pytest.raises(ValueError, match="too short for the convolutions: they need 24"):
+    with pytest.raises(ValueError, match="n_times=10: expected at least 24 samples"):
         encoder(EncoderConfig(), 10, "encoder")
     with pytest.raises(ValueError, match="backend='fft'"):
         EncoderConfig(backend="fft")  # type: ignore[arg-type]

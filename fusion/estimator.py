@@ -27,6 +27,11 @@ except ImportError as error:
 __all__ = ["ARGateClassifier"]
 
 
+def _recur(x: Float[np.ndarray, "n k 1"]) -> bool:
+    """Whether every sensor gives few distinct readings, each about eight times or more."""
+    return all(8 * len(np.unique(x[:, k])) <= len(x) for k in range(x.shape[1]))
+
+
 class ARGateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
     """Gated sensor fusion that is trained on failing sensors, with scikit-learn's interface.
 
@@ -98,7 +103,8 @@ class ARGateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
             seed=self.seed,
         )
         k, t = data.n_channels, data.n_time
-        levels = reading_levels(data.train_x, 256) if t == 1 else ()
+        # Known readings help where readings recur; of a continuous sensor no reading ever does.
+        levels = reading_levels(data.train_x) if t == 1 and _recur(data.train_x) else ()
         model = ModelConfig(
             self.model,
             n_sensors=k,

@@ -20,7 +20,9 @@ Y = np.array(["idle", "busy"])[RNG.integers(0, 2, 400)]
 X = np.where(Y == "busy", 1.0, -1.0)[:, None] * np.array([1.0, 50.0, 1e-3, 4.0]) + np.array(
     [0.4, 20.0, 4e-4, 1.6]
 ) * RNG.normal(size=(400, 4))
-SMALL = ARGateClassifier(epochs=4, features=6, gate_width=6, head_width=8, batch_size=32)
+SMALL = ARGateClassifier(
+    epochs=12, features=6, gate_width=6, head_width=8, batch_size=16, learning_rate=1e-2
+)
 
 
 def test_it_fits_scores_and_survives_a_missing_sensor() -> None:

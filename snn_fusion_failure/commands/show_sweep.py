@@ -56,6 +56,7 @@ def look(config: Show) -> dict[str, Any]:
     from snn_fusion_failure.sweeps import rank
     from snn_fusion_failure.sweeps.engine import collect
     from snn_fusion_failure.sweeps.folder import held_sweep
+    from snn_fusion_failure.sweeps.worker import brief
 
     sweep = held_sweep(config.out)
     dataset, result = collect(sweep)
@@ -68,7 +69,7 @@ def look(config: Show) -> dict[str, Any]:
     failures = json.loads(dataset.attrs["failures"])
     for place, message in list(failures.items())[:5]:
         setting, _, seed = place.partition("/")
-        print(f"setting {setting} seed {seed} failed: {message.splitlines()[0]}")
+        print(f"setting {setting} seed {seed} failed: {brief(message)}")
     if len(failures) > 5:
         print(f"... and {len(failures) - 5} more")
     for note in json.loads(dataset.attrs["notes"]):

@@ -136,6 +136,7 @@ def main(config: Config) -> dict[str, Any]:
     import jax
 
     from snn_fusion_failure.sweeps.engine import collect
+    from snn_fusion_failure.sweeps.worker import brief
 
     check(config)
     if config.distributed:
@@ -148,7 +149,7 @@ def main(config: Config) -> dict[str, Any]:
     except KeyboardInterrupt:
         words = f"finished chunks are in {config.out}; the same command goes on"
         raise KeyboardInterrupt(words) from None
-    for error in dict.fromkeys(errors[:5]):
+    for error in list(dict.fromkeys(map(brief, errors)))[:5]:
         print(f"warning: {error}", file=sys.stderr)
     if jax.process_index() > 0:
         return {"complete": True}

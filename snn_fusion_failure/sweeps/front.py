@@ -11,6 +11,7 @@ from snn_fusion_failure.sweeps.axes import Axis
 from snn_fusion_failure.sweeps.engine import Layout, build, collect, describe, execute, open_sweep
 from snn_fusion_failure.sweeps.study import Metric, Study, load_study
 from snn_fusion_failure.sweeps.trial import from_trial
+from snn_fusion_failure.sweeps.worker import brief
 
 __all__ = ["axes_of", "sweep"]
 
@@ -139,7 +140,7 @@ def sweep(
     errors = execute(opened, run=run)
     dataset, counts = collect(opened)
     if counts["failed"] or not counts["complete"]:
-        first = f"; {errors[0]}" if errors else ""
+        first = f"; {brief(errors[0])}" if errors else ""
         raise WorkFailedError(f"{describe(counts)} in {out}{first}")
     return dataset
 

@@ -52,6 +52,7 @@ def find_function(
             sys.path.append(place)
     try:
         loaded = _load_file(module) if module.endswith(".py") else importlib.import_module(module)
+        _refuse_hidden(name, module, getattr(loaded, "__file__", None))
         found: Any = loaded
         for part in attribute.split("."):
             found = getattr(found, part)
@@ -59,16 +60,19 @@ def find_function(
         raise ValueError(
             f"study={name!r}: expected a function that can be imported; {error}"
         ) from error
+    if not callable(found):
+        raise ValueError(f"study={name!r}: expected a function; got {type(found).__name__}")
+    return found
+
+
+def _refuse_hidden(name: str, module: str, used: str | None) -> None:
+    """Refuse an installed module where this directory has one of the same name."""
     own = Path(os.getcwd(), *module.split(".")).with_suffix(".py")
-    used = getattr(loaded, "__file__", None)
-    if own.is_file() and used and not own.samefile(used):
+    if not module.endswith(".py") and own.is_file() and used and not own.samefile(used):
         raise ValueError(
             f"study={name!r}: expected {own.name} of this directory, but {used} has the same "
             "name; rename yours"
         )
-    if not callable(found):
-        raise ValueError(f"study={name!r}: expected a function; got {type(found).__name__}")
-    return found
 
 
 def _load_file(text: str) -> Any:

@@ -26,7 +26,7 @@ from snn_fusion_failure.sweeps.program import Program, compile_study, out_of_mem
 from snn_fusion_failure.sweeps.source import changes, fingerprint
 from snn_fusion_failure.sweeps.study import Study
 
-__all__ = ["Worker", "check_source", "retry_failed"]
+__all__ = ["Worker", "brief", "check_source", "retry_failed"]
 
 
 def check_source(sweep: Sweep) -> dict[str, Any]:
@@ -52,6 +52,14 @@ def check_source(sweep: Sweep) -> dict[str, Any]:
     return mine
 
 
+def brief(message: str) -> str:
+    """An exception's text in one line: how it begins and, of a traceback, how it ends."""
+    lines = [line.strip() for line in message.strip().splitlines() if line.strip()]
+    if len(lines) < 2:
+        return "".join(lines)
+    return f"{lines[0].removesuffix(': Traceback (most recent call last):')[:120]} ... {lines[-1]}"
+
+
 class Worker:
     """Runs chunks of a sweep; compiles when the first of a kind comes, once each."""
 
@@ -61,6 +69,7 @@ class Worker:
         self.source = check_source(sweep)["id"]
         self._rows: tuple[tuple[Any, ...], ...] = ()
         self._programs: dict[str, Program] = {}
+        self._studies: dict[str, Study] = {}
         self._notes: list[str] = []
 
     def rows(self, settings: np.ndarray) -> list[tuple[Any, ...]]:
@@ -92,7 +101,13 @@ class Worker:
         return ladder[ladder.index(budget) - 1] or 0
 
     def study(self, segment: Segment) -> Study:
-        """The study of a segment: its static values, its budget."""
+        """The study of a segment: its static values, its budget. Made once: it may be traced."""
+        name = self.kind(segment)
+        if name not in self._studies:
+            self._studies[name] = self._make_study(segment)
+        return self._studies[name]
+
+    def _make_study(self, segment: Segment) -> Study:
         study = self.sweep.study
         assert study is not None
         (row,) = self.rows(np.asarray(segment.settings[:1]))

@@ -75,8 +75,8 @@ def write_page(dataset: Any, path: Path, *, live: bool = False) -> Path:
     """Write the page; `live` lets it reload itself. Returns the file."""
     template = resources.files("snn_fusion_failure.sweeps").joinpath("page.html")
     data = page_data(dataset)
-    # "</" would end the script element, whatever stands around it.
-    text = json.dumps(data, allow_nan=False).replace("</", "<\\/")
+    # "<" could end the script element, whatever stands around it.
+    text = json.dumps(data, allow_nan=False).replace("<", "\\u003c")
     refresh = '<meta http-equiv="refresh" content="5">' if live else ""
     write_text(
         path,

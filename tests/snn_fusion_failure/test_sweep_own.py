@@ -64,7 +64,7 @@ def test_every_kind_of_axis_at_once(tmp_path) -> None:
     # One compiled program per pair of static values: a trace for each, and those of the check.
     pairs = {(int(w), str(n)) for w, n in zip(data["width"].values, data["norm"].values,
                                               strict=True)}  # fmt: skip
-    assert len(TRACES) <= 3 * len(pairs) + 2
+    assert len(TRACES) <= 4 * len(pairs) + 2  # two checks, a compilation and its batch
 
 
 def test_the_five_lines_of_the_page(tmp_path, monkeypatch) -> None:

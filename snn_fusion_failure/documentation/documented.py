@@ -119,6 +119,7 @@ RULES = (
     Rule("bench_detector.py", "--size tiny --repeats 1 --gemm 64"),
     Rule("bench_kitti_eval.py", "--frames 2 --repeats 1"),
     # Chapter 4.
+    Rule("find_failures.py --netlist", "--n-total 40 --overwrite", needs="ngspice"),
     Rule("find_failures.py rev_argate_bnn", f"{_SEARCH} --n-total 51"),
     Rule("find_failures.py", f"{_SEARCH} --n-init 6 --n-total 8"),
     Rule(

@@ -54,6 +54,10 @@ __all__ = [
 # When the data outgrow one of these, a cold fit checks the warm one for a better optimum.
 COLD_CHECKS = (96, 192, 320)
 
+# Hyper-parameters are fitted to this many points at most: a fit is cubic in them, and few numbers
+# per coordinate do not need a thousand. The posterior is always that of all points.
+FIT_POINTS = 384
+
 # Relative gain that ends a refit: far below one nat of log evidence in 300 data points.
 FIT_FTOL = 1e-6
 
@@ -171,12 +175,32 @@ def _targets(state: SearchState, size: int) -> tuple[np.ndarray, np.ndarray]:
     return y, best
 
 
+def fit_rows(y: np.ndarray) -> np.ndarray:
+    """Rows of each seed that hyper-parameters are fitted to, `[S, min(n, FIT_POINTS)]`.
+
+    The better half are the largest outputs, around which the search goes on; the others are
+    spread evenly over the history. Invalid outputs come last.
+    """
+    n = y.shape[1]
+    if n <= FIT_POINTS:
+        return np.tile(np.arange(n), (len(y), 1))
+    order = np.argsort(-np.where(np.isfinite(y), y, -np.inf), axis=1, kind="stable")
+    top = FIT_POINTS // 2
+    rest = np.sort(order[:, top:], axis=1)
+    even = np.linspace(0, n - top - 1, FIT_POINTS - top).round().astype(int)
+    return np.sort(np.concatenate([order[:, :top], rest[:, even]], axis=1), axis=1)
+
+
 def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
     """Fit hyper-parameters: from the last ones where there are any, else from the priors' mode."""
     fit = _programs(config.gp, config.acquisition)["fit"]
     seeds, dim = len(config.seeds), x.shape[2]
-    count = jnp.full((seeds,), state.n, jnp.int32)
     old = state.surrogate
+    count = jnp.full((seeds,), min(state.n, FIT_POINTS), jnp.int32)
+    if state.n > FIT_POINTS:
+        rows = jnp.asarray(fit_rows(state.y))
+        x = jnp.take_along_axis(x, rows[:, :, None], axis=1)
+        y = jnp.take_along_axis(y, rows, axis=1)
     result = None
     if old is None or bisect_left(COLD_CHECKS, old.n_fit) != bisect_left(COLD_CHECKS, state.n):
         start = _stack(gp_fit.initial_params(config.gp, dim), seeds)

@@ -200,3 +200,17 @@ def test_bad_configurations_say_what_is_known():
 def test_the_callers_precision_is_left_alone(full_run):
     assert full_run.x.dtype == np.float64
     assert jax.numpy.zeros(()).dtype == np.float32
+
+
+def test_hyper_parameters_are_fitted_to_a_part_of_many_points():
+    from failure.search.bayesopt import FIT_POINTS, fit_rows
+
+    y = np.stack([np.arange(1000.0), -np.arange(1000.0)])
+    y[0, 999] = np.nan
+    rows = fit_rows(y)
+    assert rows.shape == (2, FIT_POINTS)
+    assert all(len(set(r)) == FIT_POINTS for r in rows.tolist())
+    # the largest outputs are there, the invalid one is the last choice, the rest is spread
+    assert set(range(900, 999)) <= set(rows[0]) and set(range(100)) <= set(rows[1])
+    assert np.diff(rows[1]).max() < 8
+    np.testing.assert_array_equal(fit_rows(y[:, :50])[1], np.arange(50))

@@ -23,7 +23,7 @@ def write_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
         with os.fdopen(handle, "wb") as file:
-            np.savez(file, header=text, **arrays)
+            np.savez(file, header=text, **arrays)  # type: ignore[arg-type]
         os.replace(temporary, path)
     except BaseException:
         Path(temporary).unlink(missing_ok=True)

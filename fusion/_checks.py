@@ -8,11 +8,11 @@ from __future__ import annotations
 
 import difflib
 import math
-import numbers
 from collections.abc import Iterable, Sequence
 from typing import Any
 
 import jax
+import numpy as np
 
 __all__ = ["check_choice", "check_count", "check_counts", "check_key", "check_number", "check_type"]
 
@@ -32,7 +32,7 @@ def check_count(name: str, value: Any, low: int = 1, high: int | None = None) ->
     bounds = (
         f"a whole number of at least {low}" if high is None else f"a whole number {low}..{high}"
     )
-    if isinstance(value, bool) or not isinstance(value, numbers.Integral):
+    if isinstance(value, bool) or not isinstance(value, int | np.integer):
         raise TypeError(f"{name}={value!r}: expected {bounds}; write it without a decimal point")
     if value < low or (high is not None and value > high):
         fix = "raise it" if value < low else "lower it"
@@ -67,7 +67,7 @@ def check_number(
     """
     if isinstance(value, bool | str) or value is None:
         raise TypeError(f"{name}={value!r}: expected a number; give one")
-    if not isinstance(value, numbers.Real):
+    if not isinstance(value, int | float | np.integer | np.floating):
         return
     good = math.isfinite(value) and low <= value <= high
     good = good and not (above and value == low) and not (below and value == high)

@@ -43,19 +43,18 @@ def plot_cases(
     rows = range(len(cases))
     axes.barh(rows, [value for value, _, _ in cases.values()], color=CLEAN, alpha=0.6, height=0.6)
     for column, color, label in ((1, FAILED, "source"), (2, "black", "best possible")):
-        marks = [
-            (row[column], i) for i, row in enumerate(cases.values()) if row[column] is not None
-        ]
-        for i, (value, row) in enumerate(marks):
+        known = [(i, row[column]) for i, row in enumerate(cases.values())]
+        marks = [(i, value) for i, value in known if value is not None]
+        for number, (row, value) in enumerate(marks):
             axes.plot(
                 [value, value],
                 [row - 0.38, row + 0.38],
                 color=color,
                 linewidth=2.5,
-                label=label if i == 0 else None,
+                label=None if number else label,
             )
-    for row, (value, _, _) in enumerate(cases.values()):
-        axes.text(1.0, row, f"{value:.1f} %", va="center", fontsize=9, color="white")
+    for row, (accuracy, _, _) in enumerate(cases.values()):
+        axes.text(1.0, row, f"{accuracy:.1f} %", va="center", fontsize=9, color="white")
     axes.set_yticks(rows, list(cases))
     axes.invert_yaxis()
     axes.set_xlim(0.0, 100.0)

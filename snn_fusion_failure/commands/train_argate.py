@@ -4,7 +4,7 @@
 
 trains ARGate-L twice on smartphone activity windows, with all sensors working and with four of nine
 replaced by noise in two thirds of the windows, and ends with both accuracies beside the source's,
-pictures, and a line `result: ...`: half a minute of CPU time. `--protocol` trains one case only.
+pictures, and a line `result: ...`: a minute and a half of CPU time. `--protocol` trains one case.
 `--preset quick` takes few epochs; the default `paper` has the settings of record. With
 `--dataset simulated` no data file is needed.
 """

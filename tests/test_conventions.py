@@ -10,16 +10,12 @@ import pytest
 from tests import _conventions as conventions
 
 ROOT = Path(__file__).resolve().parent.parent
-KNOWN = set((ROOT / "tests" / "known_arguments.txt").read_text(encoding="utf-8").split())
-"""Functions that do not follow the order yet; only ever shorter."""
 FUNCTIONS = list(conventions.public_functions(*conventions.PACKAGES))
 
 
 def test_arguments_come_as_config_params_state_inputs_key() -> None:
     found = {
-        name: faults
-        for name, node in FUNCTIONS
-        if name not in KNOWN and (faults := conventions.argument_faults(node))
+        name: faults for name, node in FUNCTIONS if (faults := conventions.argument_faults(node))
     }
     assert found == {}
 
@@ -45,13 +41,10 @@ def test_the_rule_itself(code: str, good: bool) -> None:
     assert (conventions.argument_faults(node) == []) is good
 
 
-KNOWN_PLOTS: set[str] = set()
-
-
 def test_plots_return_a_figure_that_the_caller_saves() -> None:
     for name, node in FUNCTIONS:
         module, function = name.rsplit(".", 1)
-        if module.endswith("plots") and name not in KNOWN_PLOTS:
+        if module.endswith("plots"):
             result = ast.unparse(node.returns).strip("'\"") if node.returns else ""
             assert function.startswith("plot_"), name
             # One figure, or several by name.

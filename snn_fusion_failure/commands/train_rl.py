@@ -31,7 +31,7 @@ from snn_fusion_failure.runs import (
     write_json,
 )
 from snn_fusion_failure.runs.command import run_command
-from snn_fusion_failure.runs.provenance import check_recordable
+from snn_fusion_failure.runs.origin import check_recordable
 
 TABLES = {1: "2.3", 2: "2.4", 3: "2.5"}
 NAMES = {"qlearning": "Q-learning", "ppo": "PPO"}

@@ -31,7 +31,7 @@ from snn_fusion_failure.runs import (
 )
 from snn_fusion_failure.runs.command import run_command
 from snn_fusion_failure.runs.networks import changed_preset
-from snn_fusion_failure.runs.provenance import check_recordable
+from snn_fusion_failure.runs.origin import check_recordable
 
 UNITS = {"n_mv": "steps", "path": "px", "path_ratio": "1", "path_ratio_median": "1"}
 TABLES = {1: "2.3", 2: "2.4", 3: "2.5"}

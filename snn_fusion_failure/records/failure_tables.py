@@ -26,7 +26,7 @@ from snn_fusion_failure.runs import (
     repository,
     write_json,
 )
-from snn_fusion_failure.runs.provenance import check_recordable
+from snn_fusion_failure.runs.origin import check_recordable
 
 TABLES = {"ldo": ("4.1", "LDO regulator"), "dcdc": ("4.2", "DC-DC converter")}
 

@@ -10,7 +10,7 @@ from typing import Any
 from snn_fusion_failure.records.intervals import interval
 from snn_fusion_failure.runs import repository
 from snn_fusion_failure.runs.files import write_json
-from snn_fusion_failure.runs.provenance import check_recordable, provenance
+from snn_fusion_failure.runs.origin import check_recordable, provenance
 
 
 def summarize(values: Sequence[float]) -> dict[str, Any]:

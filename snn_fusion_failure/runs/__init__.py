@@ -10,7 +10,7 @@ from snn_fusion_failure.runs.command import WorkFailedError, run_command
 from snn_fusion_failure.runs.console import fail, print_result, progress
 from snn_fusion_failure.runs.files import append_metrics, to_jsonable, write_json, write_text
 from snn_fusion_failure.runs.folder import open_run
-from snn_fusion_failure.runs.provenance import command_line, provenance
+from snn_fusion_failure.runs.origin import command_line, provenance
 from snn_fusion_failure.runs.repository import enable_compilation_cache
 
 __all__ = [

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.runs.files import to_jsonable, write_json
-from snn_fusion_failure.runs.provenance import provenance
+from snn_fusion_failure.runs.origin import provenance
 
 
 def open_run(

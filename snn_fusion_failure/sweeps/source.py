@@ -20,7 +20,7 @@ from collections.abc import Callable, Iterable, Mapping
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.runs.provenance import versions
+from snn_fusion_failure.runs.origin import versions
 from snn_fusion_failure.runs.repository import ROOT
 
 __all__ = ["changes", "find_function", "fingerprint", "folder_of", "sources"]

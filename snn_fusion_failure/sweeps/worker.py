@@ -9,7 +9,7 @@ from typing import Any
 import numpy as np
 
 from snn_fusion_failure.runs.files import create_once
-from snn_fusion_failure.runs.provenance import provenance
+from snn_fusion_failure.runs.origin import provenance
 from snn_fusion_failure.sweeps.chunkfile import DamagedError, load_chunk, save_chunk
 from snn_fusion_failure.sweeps.folder import (
     FAILED,

@@ -28,7 +28,7 @@ from snn_fusion_failure.runs import (
 )
 
 # The package's own `provenance` is the function of that name.
-made_by = importlib.import_module("snn_fusion_failure.runs.provenance")
+made_by = importlib.import_module("snn_fusion_failure.runs.origin")
 folder = importlib.import_module("snn_fusion_failure.runs.folder")
 
 

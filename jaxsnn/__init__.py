@@ -9,8 +9,10 @@ optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
 
 from jaxsnn.agents import Agent, SNNParams, snn_agent, snn_params
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights
+from jaxsnn.drivers import DriverParams, drive
 from jaxsnn.encoding import poisson_spikes
 from jaxsnn.experiment import Experiment, run_experiment
+from jaxsnn.families import family_map
 from jaxsnn.maps import make_map, random_map, stack_maps
 from jaxsnn.neurons import LIFParams, LIFState, lif_init, lif_scan, lif_step
 from jaxsnn.planner import shortest_path
@@ -18,7 +20,7 @@ from jaxsnn.plasticity import STDPParams, STDPState, apply_reward, stdp_init, st
 from jaxsnn.presets import preset
 from jaxsnn.qlearning import QParams
 from jaxsnn.rewards import RewardParams
-from jaxsnn.scenarios import scenario
+from jaxsnn.scenarios import detour, scenario
 from jaxsnn.status import Status
 from jaxsnn.trials import TrialResult, run_phase, success_rate
 from jaxsnn.window import stdp_kernel, stdp_window
@@ -26,6 +28,7 @@ from jaxsnn.world import WorldParams
 
 __all__ = [
     "Agent",
+    "DriverParams",
     "Experiment",
     "LIFParams",
     "LIFState",
@@ -41,6 +44,9 @@ __all__ = [
     "Weights",
     "WorldParams",
     "apply_reward",
+    "detour",
+    "drive",
+    "family_map",
     "lif_init",
     "lif_scan",
     "lif_step",

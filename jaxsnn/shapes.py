@@ -1,4 +1,4 @@
-"""Polygons that maps are built of: boxes, regular polygons, cups, bars."""
+"""Polygons that maps are built of: boxes, regular polygons, cups."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-__all__ = ["bar", "box", "cup", "mirrored", "regular"]
+__all__ = ["box", "cup", "mirrored", "regular"]
 
 Number = int | float
 Corners = list[tuple[Number, Number]]
@@ -28,14 +28,6 @@ def regular(x: Number, y: Number, radius: Number, corners: int) -> Corners:
 def mirrored(corners: Corners, centre: tuple[Number, Number] = (400.0, 300.0)) -> Corners:
     """The polygon turned by 180 degrees about a point."""
     return [(2 * centre[0] - x, 2 * centre[1] - y) for x, y in corners]
-
-
-def bar(a: tuple[Number, Number], b: tuple[Number, Number], thickness: Number = 18.0) -> Corners:
-    """A straight wall from a to b [px]."""
-    start, end = np.asarray(a, float), np.asarray(b, float)
-    along = (end - start) / np.hypot(*(end - start))
-    side = 0.5 * thickness * np.array([-along[1], along[0]])
-    return _rounded([start - side, end - side, end + side, start + side])
 
 
 def cup(

@@ -77,6 +77,11 @@ RULES = (
     # Chapter 2.
     Rule("train_snn.py", f"{_ROBOT} --preset quick --overwrite"),
     Rule("study_transfer.py", f"{_ROBOT} --maps 1 --test-trials 1 --scenarios 1 --checkpoints 20"),
+    Rule(
+        "study_detour.py",
+        f"{_ROBOT} --models blind --rows D1 --test-trials 1",
+        forget="results/study_detour.json",
+    ),
     Rule("study_snn.py gamma", f"{_ROBOT} --test-trials 1", forget="results/study_snn_gamma.json"),
     Rule(
         "study_snn.py readings",
@@ -200,7 +205,7 @@ AREAS = {
     ),
     "robots": (
         "train_snn", "study_transfer", "study_snn", "figures_snn", "compare_snn", "bench_snn",
-        "train_rl",
+        "train_rl", "study_detour",
     ),
     "sweeps": ("sweep", "bench_sweep"),
     "fusion": ("train_argate", "study_argate", "bench_fusion", "bench_lattice", "reproduce"),

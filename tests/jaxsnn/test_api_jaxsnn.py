@@ -12,6 +12,7 @@ import pytest
 from jaxsnn import (
     agents,
     config,
+    drivers,
     encoding,
     experiment,
     geometry,
@@ -377,6 +378,12 @@ CASES = [
         lambda x, y, h: navigation.observation(PLACE, world.observe(PLACE, robot(x, y, h))),
         pose,
         (0, 1, 2),
+    ),
+    Case(
+        "drivers.driver_steering",
+        lambda p, s, d, a: drivers.driver_steering(p, world.Reading(s, d, a)),
+        lambda rng: (leaves(drivers.DRIVERS["reflex_60"]), *sight(rng)[1:3], *f32(20.0)),
+        (0, 3),
     ),
     Case(
         "navigation.start_robot",

@@ -1,0 +1,274 @@
+"""Maps on which drivers that learn nothing fail: every driver and learner in one table.
+
+    python scripts/studies/study_detour.py --models blind reflex_60 reflex_100 q_learning
+    python scripts/studies/study_detour.py --models S4 S4_literal S1 S2 S3 --seeds 16
+
+Rows are the three scenarios, their detour readings D1 to D3 (`jaxsnn.scenarios.detour`) and the
+held-out detour family: there a learner trains on one map of the family's training split and drives
+on maps of its test split that nothing was tuned on, weights or table frozen. Metrics: `sr_testing`
+after the source's 20 learning trials (2,000 for Q-learning), `sr_testing_60_trials` with
+`--learn-trials 60`, and `path_ratio` of the trials that arrived. Networks use the seeds of the
+tables of record from 0 on.
+
+Rows go to `results/study_detour.json` as each one ends; one that is there already with as many
+seeds is skipped, so the study can be broken off and gone on with. Drivers take seconds, Q-learning
+two CPU-minutes per row, a network about 10 CPU-seconds per seed and row.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import time
+from typing import Any
+
+import tyro
+
+from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.runs import (
+    enable_compilation_cache,
+    fail,
+    print_result,
+    progress,
+    repository,
+)
+from snn_fusion_failure.runs.origin import check_recordable
+
+ROWS = ("Scenario 1", "Scenario 2", "Scenario 3", "D1", "D2", "D3", "held-out detour family")
+DRIVERS = ("blind", "reflex_60", "reflex_100")
+NETWORKS = ("S1", "S2", "S3", "S4", "S4_literal")
+FAMILY = ROWS[-1]
+UNITS = {"path_ratio": "1"}
+TITLE = "Drivers and learners on maps that need a detour"
+
+
+@dataclasses.dataclass(frozen=True)
+class Study:
+    """Fill the table of detours."""
+
+    models: tuple[str, ...] = (*DRIVERS, "q_learning", "S4", "S4_literal", "S1", "S2", "S3")
+    rows: tuple[str, ...] = ROWS
+    seeds: int = 16
+    """Robots, or learners of Q-learning."""
+    test_trials: int = 20
+    learn_trials: int = 20
+    """Of the networks: 20 (the source) or 60 for the second column."""
+    family_maps: int = 20
+    """Unseen maps of the family, one trial of each robot on each."""
+    max_steps: int = 200
+    block: int = 8
+    max_minutes: float = 25.0
+    """No row is begun after so many minutes of CPU time."""
+
+
+def train_map(row: str) -> Any:
+    """The map that a learner trains on."""
+    from jaxsnn import families, scenarios
+
+    if row == FAMILY:
+        return families.family_map("detour", "train", 0)
+    if row.startswith("D"):
+        return scenarios.detour(int(row[1:]))
+    return scenarios.scenario(int(row.removeprefix("Scenario ")))
+
+
+def test_maps(config: Study, row: str) -> list[Any]:
+    """The maps of the testing trials."""
+    from jaxsnn import families
+
+    if row != FAMILY:
+        return [train_map(row)]
+    return [families.family_map("detour", "test", i) for i in range(config.family_maps)]
+
+
+def trials_per_map(config: Study, row: str) -> int:
+    """Testing trials of each robot on each map."""
+    return 1 if row == FAMILY else config.test_trials
+
+
+def values_of(maps: list[Any], status: Any, path: Any, starts: Any) -> dict[str, list[float]]:
+    """One value per robot from `[maps, robots, trials]` of status, path and start points."""
+    import numpy as np
+
+    from jaxsnn import planner
+    from jaxsnn.status import Status
+
+    arrived = status == Status.ARRIVED
+    ratio = np.full(path.shape, np.nan)
+    for i, map in enumerate(maps):
+        if arrived[i].any():
+            points = starts[i][arrived[i]].astype(np.float64)
+            ratio[i][arrived[i]] = path[i][arrived[i]] / planner.path_field(map).lengths(points)
+    robots = range(status.shape[1])
+    ratios = [float(np.nanmean(ratio[:, r])) for r in robots if arrived[:, r].any()]
+    return {"sr_testing": (100.0 * arrived.mean(axis=(0, 2))).tolist(), "path_ratio": ratios}
+
+
+def run_driver(config: Study, model: str, row: str) -> dict[str, list[float]]:
+    """A driver that learns nothing, from the networks' own starts."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxsnn.drivers import DRIVERS as PARAMS
+    from jaxsnn.drivers import drive
+
+    params = jax.tree.map(jnp.float32, PARAMS[model])
+
+    def phase(map: Any, keys: Any, n: int) -> Any:
+        return drive(params, map, keys=keys, n_trials=n, max_steps=config.max_steps)
+
+    return _test(config, row, phase, jnp, np)
+
+
+def _test(config: Study, row: str, phase: Any, jnp: Any, np: Any) -> dict[str, list[float]]:
+    """Drive `phase(map, keys, n_trials)` over the test maps of a row."""
+    import jax
+
+    from jaxsnn.experiment import phase_keys, seed_keys
+    from jaxsnn.trials import start_states
+
+    n, maps = trials_per_map(config, row), test_maps(config, row)
+    roots = jax.vmap(lambda k: phase_keys(k)[2])(seed_keys(jnp.arange(config.seeds)))
+    status, path, points = [], [], []
+    starts = jax.jit(
+        lambda map, keys: jax.vmap(lambda k: start_states(map, key=k, n_trials=n))(keys)
+    )
+    for i, map in enumerate(maps):
+        keys = jax.vmap(lambda k, i=i: jax.random.fold_in(k, i))(roots) if len(maps) > 1 else roots
+        result, begin = phase(map, keys, n), starts(map, keys)
+        status.append(np.asarray(result.status))
+        path.append(np.asarray(result.path))
+        points.append(np.stack([np.asarray(begin.x), np.asarray(begin.y)], axis=-1))
+    return values_of(maps, np.stack(status), np.stack(path), np.stack(points))
+
+
+def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
+    """A spiking network: learning on the row's map, testing with frozen weights."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxsnn import agents, trials
+    from jaxsnn.experiment import learning_circles, make_runner
+    from jaxsnn.presets import preset
+
+    name, _, reading = model.partition("_")
+    network, params = preset(name, reading or "tuned")
+    scenario = int(row[-1]) if row != FAMILY else 1
+    learn = make_runner(
+        network, train_map(row), n_learn=config.learn_trials, n_test=1,
+        max_steps=config.max_steps, block=config.block, keep_states=True,
+        circles=learning_circles(scenario, config.learn_trials),
+    )  # fmt: skip
+    states = jax.tree.map(jnp.asarray, learn(range(config.seeds), params).states)
+    frozen = agents.snn_agent(network, plastic=False)
+    constants = jax.tree.map(jnp.float32, agents.snn_params(network, params))
+
+    @jax.jit
+    def test(map: Any, words: Any, states: Any, constants: Any) -> Any:
+        return trials.run_phase(
+            frozen, constants, map, states, keys=jax.random.wrap_key_data(words),
+            n_trials=trials_per_map(config, row), max_steps=config.max_steps,
+        )[1]  # fmt: skip
+
+    def phase(map: Any, keys: Any, n: int) -> Any:
+        return test(map, jax.random.key_data(keys), states, constants)
+
+    return _test(config, row, phase, jnp, np)
+
+
+def run_q_learning(config: Study, model: str, row: str) -> dict[str, list[float]]:
+    """Tables trained for 2,000 trials on the row's map, greedy in testing."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from jaxsnn import qlearning
+    from jaxsnn.status import Status
+    from jaxsnn.trials import TrialResult
+
+    run = jax.jit(qlearning.run_trials, static_argnames=("n_trials", "max_steps", "learn"))
+    params = qlearning.QParams(*(jnp.float32(v) for v in qlearning.QParams()))
+    keys = jax.random.split(jax.random.key(31), config.seeds)
+    tables, map = qlearning.init(config.seeds), train_map(row)
+    for done in range(0, 2000, 100):
+        tables, _ = run(
+            params, map, tables, keys=keys, n_trials=100, max_steps=config.max_steps,
+            learn=True, first_trial=done,
+        )  # fmt: skip
+    greedy = params._replace(epsilon=jnp.float32(0.0))
+    held: dict[str, Any] = {}
+
+    def phase(map: Any, keys: Any, n: int) -> Any:
+        _, trials = run(
+            greedy, map, tables, keys=keys, n_trials=n, max_steps=config.max_steps, learn=False
+        )
+        status = jnp.where(trials.arrived, Status.ARRIVED, Status.TIMEOUT)
+        status = jnp.where(trials.collided, Status.COLLIDED, status)
+        held.setdefault("starts", []).append(np.asarray(trials.start))
+        return TrialResult(status, trials.steps, trials.length, jnp.zeros(()), None)
+
+    n, maps = trials_per_map(config, row), test_maps(config, row)
+    results = [phase(m, jax.random.split(jax.random.key(37 + i), config.seeds), n)
+               for i, m in enumerate(maps)]  # fmt: skip
+    return values_of(
+        maps,
+        np.stack([np.asarray(r.status) for r in results]),
+        np.stack([np.asarray(r.path) for r in results]),
+        np.stack(held["starts"]),
+    )
+
+
+def runner(model: str) -> Any:
+    """What runs a model."""
+    if model in DRIVERS:
+        return run_driver
+    return run_q_learning if model == "q_learning" else run_network
+
+
+def main(config: Study) -> dict[str, float]:
+    """Run the cells that are missing; returns success by model and row."""
+    known = (*DRIVERS, "q_learning", *NETWORKS)
+    for name, given, allowed in (("models", config.models, known), ("rows", config.rows, ROWS)):
+        if unknown := [g for g in given if g not in allowed]:
+            raise ValueError(f"{name}={unknown}: expected some of {list(allowed)}; choose")
+    if config.learn_trials not in (20, 60):
+        raise ValueError(f"learn_trials={config.learn_trials}: expected 20 or 60; choose one")
+    check_recordable()
+    enable_compilation_cache()
+    path = repository.RESULTS / "study_detour.json"
+    held = set()
+    if path.exists():
+        for cell in json.loads(path.read_text(encoding="utf-8"))["rows"]:
+            if cell["n"] >= config.seeds:
+                held.add((cell["model"], cell["row"], cell["metric"]))
+    metric = "sr_testing" if config.learn_trials == 20 else "sr_testing_60_trials"
+    cells = [(m, r) for m in config.models for r in config.rows if (m, r, metric) not in held]
+    start, found = time.process_time(), {}
+    with progress() as bar:
+        task = bar.add_task("cells", total=len(cells), status="")
+        for model, row in cells:
+            if time.process_time() - start > 60 * config.max_minutes:
+                break
+            values = runner(model)(config, model, row)
+            if config.learn_trials != 20:
+                values = {metric: values["sr_testing"]}
+            rows = [
+                {"row": row, "model": model, "metric": name, "unit": UNITS.get(name, "%"),
+                 **summarize(v)}
+                for name, v in values.items() if v
+            ]  # fmt: skip
+            record_table(path, path.stem, TITLE, rows, preset=f"{config.seeds} robots")
+            found[f"{model} {row}"] = sum(values[metric]) / len(values[metric])
+            bar.update(task, advance=1, status=f"{model}, {row}: {found[f'{model} {row}']:.0f} %")
+            print(model, row, round(found[f"{model} {row}"], 1), flush=True)
+    return found
+
+
+if __name__ == "__main__":
+    try:
+        done = main(tyro.cli(Study, description=__doc__))
+    except ValueError as error:
+        fail(str(error))
+    print_result(cells=len(done), file="results/study_detour.json")

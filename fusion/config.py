@@ -164,7 +164,7 @@ class HyperParams(_HyperParams):
         return super().__new__(cls, learning_rate, weight_decay, loss)
 
     @classmethod
-    def _make(cls, iterable: Iterable[Any]) -> HyperParams:
+    def _make(cls, iterable: Iterable[Any]) -> HyperParams:  # type: ignore[override]
         return cls(*iterable)
 
 

@@ -32,7 +32,7 @@ def _recur(x: Float[np.ndarray, "n k 1"]) -> bool:
     return all(8 * len(np.unique(x[:, k])) <= len(x) for k in range(x.shape[1]))
 
 
-class ARGateClassifier(ClassifierMixin, BaseEstimator):  # type: ignore[misc]
+class ARGateClassifier(ClassifierMixin, BaseEstimator):
     """Gated sensor fusion that is trained on failing sensors, with scikit-learn's interface.
 
     `X` is `[N, K, T]`, windows of T samples of K sensors, or `[N, K]`, one reading of each sensor

@@ -65,7 +65,7 @@ class LossParams(_LossParams):
         return super().__new__(cls, alpha, beta, tau, anchor)
 
     @classmethod
-    def _make(cls, iterable: Iterable[Any]) -> LossParams:
+    def _make(cls, iterable: Iterable[Any]) -> LossParams:  # type: ignore[override]
         return cls(*iterable)
 
 

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 from fusion._checks import check_choice
 from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
@@ -49,7 +49,7 @@ _SIMULATED = Preset(
 )
 _BY_DATASET = {"har": _HAR, "driver": _DRIVER, "simulated": _SIMULATED}
 # Equal weights in the alpha term; classes of HAR overlap, so its labels are smoothed.
-_LOSS = {
+_LOSS: dict[str, dict[str, Any]] = {
     "har": {"uniform_floor": 1.0, "label_smoothing": 0.05},
     "driver": {"uniform_floor": 1.0, "label_smoothing": 0.0},
     "simulated": {"uniform_floor": 1.0, "label_smoothing": 0.0},

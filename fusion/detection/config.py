@@ -1,4 +1,4 @@
-"""Sizes and choices of the two-stage detector; `fusion.detection.presets` has sets of them."""
+"""Sizes and choices of the detectors; `fusion.detection.presets` has sets of them."""
 
 from __future__ import annotations
 
@@ -11,9 +11,9 @@ from fusion.gating import Normalizer
 from fusion.losses import LossConfig
 from fusion.targets import TargetConfig
 
-__all__ = ["CAR_SIZES", "DETECTORS", "DetectorConfig", "DetectorModel"]
+__all__ = ["CAR_SIZES", "DETECTORS", "DenseConfig", "DetectorConfig", "DetectorModel"]
 
-DetectorModel = Literal["avod", "avod_argate"]
+DetectorModel = Literal["avod", "avod_argate", "dense", "dense_argate"]
 DETECTORS: tuple[str, ...] = get_args(DetectorModel)
 
 # k-means of the 14,357 labelled cars of the usual training list: length, width, height [m].
@@ -21,11 +21,54 @@ CAR_SIZES = ((3.513, 1.581, 1.511), (4.234, 1.653, 1.546))
 
 
 @dataclasses.dataclass(frozen=True)
+class DenseConfig:
+    """Sizes of the one-stage detector on a grid over the ground.
+
+    Attributes:
+        cell: side of a cell of the grid [m], a multiple of the map's.
+        lidar_width: channels of the lidar's grid; camera_widths: of the camera's maps at half and
+            at a quarter of the image's resolution; trunk_widths: at the grid's resolution and
+            below it.
+        heights: above ground at which a cell samples the camera's map [m].
+        heat_sd, radius: deviation of the heat around a car's centre, and how near to it cells tell
+            its box [m].
+        nms, candidates: rotated overlap limit between detections, and of how many.
+    """
+
+    cell: float = 0.5
+    lidar_width: int = 32
+    camera_widths: tuple[int, int] = (16, 32)
+    trunk_widths: tuple[int, int] = (32, 64)
+    heights: tuple[float, ...] = (0.4, 1.0, 1.6)
+    heat_sd: float = 0.45
+    radius: float = 0.9
+    nms: float = 0.1
+    candidates: int = 64
+
+    def __post_init__(self) -> None:
+        """Check widths and lengths."""
+        widths = (self.lidar_width, *self.camera_widths, *self.trunk_widths)
+        if any(width < 4 or width % 4 for width in widths):
+            raise ValueError(f"dense widths={widths}: expected multiples of 4, for group norm")
+        for name in ("cell", "heat_sd", "radius"):
+            if not getattr(self, name) > 0:
+                raise ValueError(f"{name}={getattr(self, name)}: expected a length above 0 [m]")
+        if not self.heights or not 0 <= self.nms <= 1 or self.candidates < 1:
+            raise ValueError(
+                f"heights={self.heights}, nms={self.nms}, candidates={self.candidates}: expected "
+                "at least one height and candidate, and a share"
+            )
+
+
+@dataclasses.dataclass(frozen=True)
 class DetectorConfig:
     """Everything static of the detector; the defaults are AVOD's.
 
     Attributes:
-        model: `avod` (mean fusion) or `avod_argate` (fusion weights).
+        model: `avod` (mean fusion) or `avod_argate` (fusion weights), in two stages; `dense` or
+            `dense_argate`, in one stage on a grid over the ground.
+        dense: sizes of the latter two, which share with AVOD what is about area, image, labels,
+            gate and paths.
         bev, anchors: area and anchor grid.
         image_size: rows and columns that images are resized to.
         max_points, max_objects: fixed sizes of scan and labels.
@@ -34,6 +77,8 @@ class DetectorConfig:
         rpn_width, rpn_crop: units of the first stage's two towers, side of its crops.
         fc_widths, second_crop: fully connected layers of the second stage, side of its crops.
         gate_width: hidden units of the gate; normalizer: of the fusion weights.
+        gate_statistics: the gate reads statistics of the raw picture and map beside the feature
+            maps, and tells the probability that each sensor has failed.
         dropout: in both stages' heads; path_drop: probability to drop a view in training.
         rpn_batch, rpn_iou: mini-batch of anchors; ground overlap below which an anchor is negative
             and from which it is positive.
@@ -52,6 +97,7 @@ class DetectorConfig:
     """
 
     model: DetectorModel = "avod_argate"
+    dense: DenseConfig = dataclasses.field(default_factory=DenseConfig)
     bev: BevConfig = dataclasses.field(default_factory=BevConfig)
     anchors: AnchorConfig = dataclasses.field(default_factory=lambda: AnchorConfig(CAR_SIZES))
     image_size: tuple[int, int] = (360, 1200)
@@ -66,6 +112,7 @@ class DetectorConfig:
     second_crop: int = 7
     gate_width: int = 32
     normalizer: Normalizer = "softmax"
+    gate_statistics: bool = True
     dropout: float = 0.5
     path_drop: float = 0.1
     rpn_batch: int = 512
@@ -114,6 +161,24 @@ class DetectorConfig:
                     f"{name}={(low, high)}: expected the negative limit, then the positive, in "
                     "[0, 1)"
                 )
+        stride = self.dense.cell / self.bev.cell
+        if self.is_dense and (
+            abs(stride - round(stride)) > 1e-6 or any(n % round(stride) for n in self.bev.shape)
+        ):
+            raise ValueError(
+                f"cell={self.dense.cell}: expected a multiple of the map's {self.bev.cell} m that "
+                f"divides its {self.bev.shape[0]} x {self.bev.shape[1]} cells"
+            )
         for name in ("dropout", "path_drop"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: expected a share in [0, 1)")
+
+    @property
+    def gated(self) -> bool:
+        """Has the model a gate, auxiliary paths and targets?"""
+        return self.model.endswith("_argate")
+
+    @property
+    def is_dense(self) -> bool:
+        """Is it the one-stage detector?"""
+        return self.model.startswith("dense")

@@ -5,7 +5,7 @@ from __future__ import annotations
 import dataclasses
 from typing import Literal, NamedTuple, get_args
 
-from fusion.detection.config import CAR_SIZES, DETECTORS, DetectorConfig
+from fusion.detection.config import CAR_SIZES, DETECTORS, DenseConfig, DetectorConfig
 from fusion.detection.geometry.anchors import AnchorConfig
 from fusion.detection.geometry.bev import BevConfig
 from fusion.detection.learning.params import DetectorParams
@@ -79,6 +79,20 @@ def _tiny(base: DetectorConfig) -> DetectorConfig:
     )
 
 
+def _dense(size: str, made: DetectorSetup) -> DetectorSetup:
+    """The one-stage detector's widths, losses and schedule."""
+    config, train, rates = made
+    if size == "paper":
+        dense = DenseConfig(lidar_width=64, camera_widths=(32, 64), trunk_widths=(64, 128))
+    elif size == "small":
+        dense = DenseConfig()
+        train = dataclasses.replace(train, steps=1500, batch_size=2)
+    else:
+        dense = DenseConfig(lidar_width=8, camera_widths=(4, 8), trunk_widths=(8, 8), candidates=16)
+    config = dataclasses.replace(config, dense=dense, regression_weight=1.0, norm="group")
+    return DetectorSetup(config, train, rates._replace(clip_norm=5.0))
+
+
 def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
     """A detector of a size, and its training.
 
@@ -86,7 +100,7 @@ def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
         size: `paper`, AVOD's sizes and rates; `small`, 0.25 m cells over 44 x 44 m, images at a
             quarter of the side and a quarter of the width, 2,000 steps, for two CPU cores; `tiny`,
             for tests.
-        model: `avod` or `avod_argate`.
+        model: `avod`, `avod_argate`, `dense` or `dense_argate`.
 
     Raises:
         ValueError: unknown size or model.
@@ -98,6 +112,10 @@ def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
     """
     if model not in DETECTORS:
         raise ValueError(f"model={model!r}: expected one of {', '.join(DETECTORS)}")
+    if model.startswith("dense"):
+        twin = preset(size, model.replace("dense", "avod"))
+        made = twin._replace(config=dataclasses.replace(twin.config, model=model))
+        return _dense(size, made)
     base = DetectorConfig(model=model)  # type: ignore[arg-type]
     rates = DetectorParams()
     if size == "paper":

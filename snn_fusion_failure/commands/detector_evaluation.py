@@ -90,7 +90,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
     if config.split != TESTING:
         widths = [float(camera.image_size[1]) for camera in cameras.values()]
         summary |= _score(config, names, objects, widths, out)
-    if config.failure and config.model == "avod_argate":
+    if config.failure and setup.config.gated:
         path = _clean_weights(folder, config)
         if not path.exists():
             clean = run_detector(setup.config, state, examples(), seed=config.seed)
@@ -141,7 +141,7 @@ def _score(
 
 def _clean_weights(folder: Path, config: Eval) -> Path:
     """Where the fusion weights of frames without failure are kept, to compare with."""
-    return folder / f"clean_weights_{config.split}.npy"
+    return folder / f"clean_weights_{config.data.resolve().name}_{config.split}.npy"
 
 
 def _drawn(objects: Any, threshold: float = 0.3) -> Any:

@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-Model = Literal["avod", "avod_argate"]
+Model = Literal["avod", "avod_argate", "dense", "dense_argate"]
 Size = Literal["paper", "small", "tiny"]
 ModelOption = Annotated[Model, tyro.conf.arg(aliases=["--config"])]
 SizeOption = Annotated[Size, tyro.conf.arg(aliases=["--preset"])]
@@ -93,3 +93,31 @@ class Eval:
     """Frames to draw."""
     out: Path | None = None
     """Folder of results; RUN/eval_SPLIT[_FAILURE] when left out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Robustness:
+    """Average precision of a trained detector by failure and severity, and on corrupted folders."""
+
+    data: Path
+    model: ModelOption = "avod_argate"
+    size: SizeOption = "small"
+    cache: Path | None = None
+    split: str = "val"
+    seed: int = 0
+    failures: bool = False
+    """The run that was trained with failures (names the folder)."""
+    run: Path | None = None
+    """Run folder; named as in `train` when left out."""
+    kinds: tuple[str, ...] | None = None
+    """Failures to try; all when left out, none with `--kinds` alone."""
+    levels: tuple[int, ...] = (1, 2, 3, 4, 5)
+    """Severities in fifths."""
+    corrupted: tuple[Path, ...] = ()
+    """KITTI folders with a corrupted copy of the list's frames; each is a failure of its own."""
+    overlap: float = 0.7
+    """Least overlap of a hit."""
+    baseline: Path | None = None
+    """A `robustness.json` of the detector that the corruption error (mCE) is measured against."""
+    out: Path | None = None
+    """Folder of results; RUN/robustness_SPLIT when left out. What is there is not done again."""

@@ -7,7 +7,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.commands.detector_options import Eval, Prepare, Train
+from snn_fusion_failure.commands.detector_options import Eval, Prepare, Robustness, Train
 from snn_fusion_failure.runs import apply_changes, to_jsonable
 
 # Options that do not change the numbers of a run.
@@ -21,12 +21,12 @@ _OLD_OPTIONS = {
 }  # fmt: skip
 
 
-def cache_folder(config: Prepare | Train | Eval) -> Path:
+def cache_folder(config: Prepare | Train | Eval | Robustness) -> Path:
     """Where the examples of a data folder and size are."""
     return config.cache or config.data / f"cache_{config.size}"
 
 
-def run_folder(config: Train | Eval) -> Path:
+def run_folder(config: Train | Eval | Robustness) -> Path:
     """Where a training keeps its files."""
     failing = "_failures" if config.failures else ""
     name = f"{config.data.resolve().name}_{config.model}_{config.size}{failing}_s{config.seed}"
@@ -98,7 +98,7 @@ def resolved(setup: Any) -> dict[str, Any]:
     numbers = setup.params._asdict()
     detector["gate_params"] = numbers.pop("gate")._asdict()
     training |= numbers
-    if setup.config.model == "avod":
+    if not setup.config.gated:
         # What only the gate reads may differ.
         of_gate = ("gate", "targets", "auxiliary", "balanced", "normalizer")
         detector = {k: v for k, v in detector.items() if not k.startswith(of_gate)}

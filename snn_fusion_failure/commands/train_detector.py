@@ -4,13 +4,17 @@
     python scripts/train_detector.py train --data ROOT --model avod_argate --size small --failures
     python scripts/train_detector.py eval --data ROOT --model avod_argate --size small \
         --failures --failure camera_blackout
+    python scripts/train_detector.py robustness --data ROOT --model avod_argate --size small \
+        --failures
 
 ROOT is a folder in the layout of KITTI (`training/{image_2,velodyne,calib,label_2,planes}`,
 `ImageSets/{train,val}.txt`), real or from `scripts/simulate_kitti.py`. `prepare` checks them, fits
 missing ground planes, clusters the anchor sizes and writes examples of fixed size; `train`
 writes checkpoints and can `--resume`; `eval` writes result files in KITTI's format, precision
 curves, pictures from above and of the image, and ends with a line `result: ...`. `--split testing`
-takes the frames of ROOT/testing (no labels, hence result files and no score). `small` is for two
+takes the frames of ROOT/testing (no labels, hence result files and no score). `robustness` repeats
+`eval` for every failure at severities 1 to 5 and for corrupted copies of the frames
+(`--corrupted`), and prints a table with the mean relative precision (mRA). `small` is for two
 CPU cores (minutes), `paper` for an accelerator (see docs/kitti.md).
 """
 
@@ -24,7 +28,8 @@ from typing import Annotated, Any
 import tyro
 
 from snn_fusion_failure.commands.detector_evaluation import evaluate
-from snn_fusion_failure.commands.detector_options import Eval, Prepare, Train
+from snn_fusion_failure.commands.detector_options import Eval, Prepare, Robustness, Train
+from snn_fusion_failure.commands.detector_robustness import robustness
 from snn_fusion_failure.commands.detector_runs import (
     NOT_SETTINGS,
     build,
@@ -80,7 +85,7 @@ def train(config: Train) -> dict[str, Any]:
     enable_compilation_cache()
     from fusion.detection.learning.cache import TESTING, open_cache, read_example
     from fusion.detection.learning.fitting import fit_detector
-    from fusion.detection.network.detector import count_main_parameters
+    from fusion.detection.network.build import count_main_parameters
     from fusion.detection.plots import plot_training
 
     if config.split == TESTING:
@@ -144,13 +149,16 @@ def train(config: Train) -> dict[str, Any]:
     return result
 
 
-def main(config: Prepare | Train | Eval) -> dict[str, Any]:
-    """Run one of the three commands."""
+def main(config: Prepare | Train | Eval | Robustness) -> dict[str, Any]:
+    """Run one of the four commands."""
     if isinstance(config, Prepare):
         result = prepare(config)
         shown = result
     elif isinstance(config, Train):
         result = train(config)
+        shown = result
+    elif isinstance(config, Robustness):
+        result = robustness(config)
         shown = result
     else:
         result = evaluate(config)
@@ -168,6 +176,7 @@ Command = (
     Annotated[Prepare, tyro.conf.subcommand("prepare")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Robustness, tyro.conf.subcommand("robustness")]
 )
 
 

@@ -49,8 +49,9 @@ from fusion.detection.learning.training import (
     DetectorTrainConfig,
     learning_rate,
 )
+from fusion.detection.network.build import count_main_parameters, init_detector
 from fusion.detection.network.convolution import convolve
-from fusion.detection.network.detector import count_main_parameters, fuse, init_detector
+from fusion.detection.network.detector import fuse
 from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
 from fusion.detection.network.proposals import Detections, anchor_boxes, decode_second, final_boxes
 from fusion.detection.network.views import TransposedConv
@@ -312,7 +313,7 @@ def test_right_offsets_decode_to_the_label() -> None:
     twice = jnp.concatenate([boxes, boxes + 0.05, boxes.at[:, 0].add(30.0)])
     scores = jnp.array([[0.0, 2], [0, 3], [0, 1], [0, 0.5], [0, -3], [0, 4]])
     mask = jnp.array([True, True, True, True, True, False])
-    found = final_boxes(config, twice, scores, mask, jnp.array([0.4, 0.6]))
+    found = final_boxes(config, twice, scores, mask, jnp.array([0.4, 0.6]), jnp.zeros(2))
     # Doubles go, the fifth is below the threshold, the sixth is no proposal.
     assert found.mask.tolist() == [True, True, False]
     np.testing.assert_allclose(found.boxes[:2], truth[::-1], atol=1e-4)
@@ -324,8 +325,9 @@ def test_detections_become_kitti_objects() -> None:
     truth = np.asarray(make_example(TINY, frame)[0].truth[:3], np.float32)
     truth[2] = [0, 1.6, -9, 4, 1.6, 1.5, 0]  # behind the camera
     found = Detections(
-        jnp.asarray(truth), jnp.array([0.9, 0.8, 0.7]), jnp.ones(3, bool), jnp.full(2, 0.5)
-    )
+        jnp.asarray(truth), jnp.array([0.9, 0.8, 0.7]), jnp.ones(3, bool), jnp.full(2, 0.5),
+        jnp.full(2, 0.1),
+    )  # fmt: skip
     objects = to_objects(found, frame.calibration.p2, np.array([32.0, 96.0]))
     assert len(objects) == 2 and frame.labels is not None
     np.testing.assert_allclose(objects.dimensions, frame.labels.dimensions, atol=1e-5)
@@ -396,6 +398,8 @@ def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) ->
     np.testing.assert_array_equal(found[0].boxes, found[1].boxes)
     assert found[0].mask.any() and np.isfinite(found[0].boxes).all()
     np.testing.assert_allclose(found[0].weights.sum(), 1.0, rtol=1e-5)
+    assert ((found[0].failed > 0) & (found[0].failed < 1)).all()
+    assert whole.history[0]["failure"] == pytest.approx(np.log(2), abs=0.1)
     # A dead lidar leaves the camera's proposals.
     dead = run_detector(TINY, whole.state, [example], failure="lidar_loss")
     assert dead[0].mask.any()

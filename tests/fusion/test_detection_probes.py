@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 from scipy.stats import mannwhitneyu
 
-from fusion.detection.network.detector import init_detector
+from fusion.detection.network.build import init_detector
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.presets import preset
 from tests._scripts import load_script

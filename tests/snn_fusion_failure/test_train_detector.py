@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 
 import numpy as np
@@ -27,6 +28,7 @@ from snn_fusion_failure.commands import detector_options as choices
 from snn_fusion_failure.commands import detector_runs as runs
 from snn_fusion_failure.commands import draw_detections
 from snn_fusion_failure.commands import train_detector as command
+from snn_fusion_failure.commands.detector_robustness import robustness, summarize_cells
 from tests._scripts import load_script
 
 study_detector = load_script("studies/study_detector")
@@ -240,6 +242,38 @@ def test_runs_of_other_settings_are_not_mixed(root: Path, tmp_path: Path) -> Non
     runs.check_settings(tmp_path, setup)
 
 
+def test_a_corrupted_copy_takes_the_anchor_sizes_of_the_detector(root: Path) -> None:
+    """Only its validation frames are there; anchor sizes used to be clustered from them anew."""
+    cache = prepare_cache(root, root / "cache_tiny", "tiny", splits=("train",), any_size=True)
+    path = root / "cache_tiny" / "cache.json"
+    path.write_text(path.read_text().replace(str(cache.sizes[0][0]), "4.5"))
+    like = open_cache(root / "cache_tiny")
+    assert like.sizes != cache.sizes and like.sizes[0][0] == 4.5
+    made = prepare_cache(
+        root, root / "corrupted", "tiny", splits=("val",), like=like, any_size=True
+    )
+    assert made.sizes == like.sizes == open_cache(folder).sizes
+    again = runs.build(choices.Train(root, size="tiny"), made).config.anchors
+    assert again == runs.build(choices.Train(root, size="tiny"), like).config.anchors
+    with pytest.raises(ValueError, match="the cache to be like has size 'tiny', not 'small'"):
+        prepare_cache(root, root / "other", "small", splits=only, like=like, any_size=True)
+
+
+def test_robustness_is_summarized_by_kind() -> None:
+    cells = {"a": {"1": 40.0, "5": 20.0}, "b": {"all": 10.0}}
+    found = summarize_cells(50.0, cells)
+    assert found["mean"] == pytest.approx((30 + 10) / 2)
+    assert found["mra"] == pytest.approx((0.6 + 0.2) / 2) and "mce" not in found
+    base = {"a": {"1": 20.0, "5": 20.0}, "b": {"all": 10.0}}
+    assert summarize_cells(50.0, cells, base)["mce"] == pytest.approx((140 / 160 + 1) / 2)
+    with pytest.raises(ValueError, match="baseline: no b at severities all"):
+        summarize_cells(50.0, cells, {"a": base["a"]})
+    with pytest.raises(ValueError, match=r"levels=\(0,\): expected severities from 1 to 5"):
+        robustness(choices.Robustness(Path("none"), levels=(0,)))
+    with pytest.raises(ValueError, match="kinds='camera_theft': expected of camera_noise"):
+        robustness(choices.Robustness(Path("none"), kinds=("camera_theft",)))
+
+
 @pytest.mark.slow
 @pytest.mark.relaxed
 def test_study_trains_and_evaluates_both_models(
@@ -284,6 +318,20 @@ def test_study_trains_and_evaluates_both_models(
     assert table["table"] == "study_detector_test" and table["title"].endswith("test frames")
     kinds = {(row["row"], row["split"]) for row in table["rows"]}
     assert {("clean", "test"), ("mean of failures", "test"), ("training", "train")} <= kinds
+
+    # Severities, and a corrupted copy of the list.
+    shutil.copytree(root / "training", tmp_path / "rain" / "training")
+    shutil.copytree(root / "ImageSets", tmp_path / "rain" / "ImageSets")
+    options = choices.Robustness(
+        root, size="tiny", run=run, kinds=("camera_blackout",), levels=(1, 5),
+        corrupted=(tmp_path / "rain",),
+    )  # fmt: skip
+    command.main(options)
+    text = capsys.readouterr().out
+    assert "camera_blackout" in text and "result: model=avod_argate clean=" in text
+    held = json.loads((run / "robustness_val" / "robustness.json").read_text())
+    assert set(held["cells"]) == {"camera_blackout", "rain"}
+    assert held["cells"]["rain"]["all"] == held["clean"]  # nothing was corrupted
 
     # Frames without labels: result files and no score.
     move_to_testing(root, "000003")

@@ -11,6 +11,8 @@ from fusion.detection.learning.cache import (
     write_example,
 )
 from fusion.detection.learning.checkpoints import Checkpoints
+from fusion.detection.learning.dense_objective import dense_detect, dense_loss, grid_losses
+from fusion.detection.learning.dense_targets import GridTargets, decode_cells, grid_targets
 from fusion.detection.learning.detection_loss import (
     StageLoss,
     balanced_class_loss,
@@ -37,6 +39,7 @@ from fusion.detection.learning.fitting import (
 from fusion.detection.learning.gate_objective import (
     PathLosses,
     class_losses,
+    failure_loss,
     gate_terms,
     path_losses,
 )
@@ -77,6 +80,7 @@ __all__ = [
     "DetectorState",
     "DetectorTrainConfig",
     "Example",
+    "GridTargets",
     "PathLosses",
     "Sample",
     "StageLoss",
@@ -85,10 +89,14 @@ __all__ = [
     "car_precision",
     "class_loss",
     "class_losses",
+    "decode_cells",
+    "dense_detect",
+    "dense_loss",
     "detect",
     "detector_loss",
     "draw",
     "fail_sensor",
+    "failure_loss",
     "fit_detector",
     "flip",
     "frame_depth",
@@ -96,6 +104,8 @@ __all__ = [
     "frame_order",
     "frame_part",
     "gate_terms",
+    "grid_losses",
+    "grid_targets",
     "image_scale",
     "init_training",
     "interrupt_between_steps",

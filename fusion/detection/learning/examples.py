@@ -53,7 +53,9 @@ class Example(NamedTuple):
     truth_mask: np.ndarray | Array
 
 
-_LEAST_ROAD = 0.4  # share of the points near the expected ground that lie on the fitted plane
+# Share of the points near the expected ground that lie on the fitted plane. With the camera 0.9 m
+# lower than it is said to be, it is 0.13 to 0.37 on real frames, and 0.42 to 0.8 otherwise.
+_LEAST_ROAD, _LEAST_AWAY = 0.25, 0.4  # in any case; where the height is not the expected one
 _BELOW, _MOST_BELOW = 0.7, 0.3  # [m], share of points that may lie below a given plane
 
 
@@ -71,10 +73,12 @@ def _ground(frame: Frame, camera: np.ndarray, expected: PlaneConfig) -> np.ndarr
         fit = fit_plane(camera, expected)
     except ValueError as error:
         raise ValueError(f"frame {frame.name}: {error}") from None
-    if fit.inlier_share < _LEAST_ROAD:
+    away = abs(fit.plane[3] - expected.camera_height) > 0.5 * expected.height_tolerance
+    least = _LEAST_AWAY if away else _LEAST_ROAD
+    if fit.inlier_share < least:
         raise ValueError(
             f"frame {frame.name}: {100 * fit.inlier_share:.0f} % of the points near the expected "
-            f"ground lie on one plane, expected at least {100 * _LEAST_ROAD:.0f} %: is the camera "
+            f"ground lie on one plane, expected at least {100 * least:.0f} %: is the camera "
             f"{expected.camera_height:g} m above the road and level? Give its height and tilt, or "
             "plane files"
         )

@@ -19,6 +19,7 @@ import numpy as np
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.learning.checkpoints import Checkpoints
+from fusion.detection.learning.dense_objective import dense_detect
 from fusion.detection.learning.examples import Example, make_inputs, stack_examples
 from fusion.detection.learning.inference import detect
 from fusion.detection.learning.interrupts import interrupt_between_steps
@@ -204,7 +205,7 @@ def _inputs(config: DetectorConfig, failure: str | None) -> Callable[..., Inputs
 
 @functools.lru_cache(maxsize=8)
 def _detect(config: DetectorConfig) -> Callable[..., Detections]:
-    return jax.jit(functools.partial(detect, config))
+    return jax.jit(functools.partial(dense_detect if config.is_dense else detect, config))
 
 
 def run_detector(
@@ -227,8 +228,9 @@ def run_detector(
         severity: of the failure; seed: of its noise, which depends on the frame's position too.
         on_frame: called with the number of frames done.
     """
-    # The two models differ in the gate alone, and read the same inputs.
-    read, run = _inputs(dataclasses.replace(config, model="avod"), failure), _detect(config)
+    # Models with and without a gate read the same inputs.
+    plain = dataclasses.replace(config, model="dense" if config.is_dense else "avod")
+    read, run = _inputs(plain, failure), _detect(config)
     key = jax.random.key(seed)
     out = []
     for i, example in enumerate(examples):

@@ -24,7 +24,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array
+from jaxtyping import Array, Bool, Float
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.learning.detection_loss import (
@@ -36,7 +36,7 @@ from fusion.detection.learning.sampling import Sample
 from fusion.losses import LossParams, gate_penalty
 from fusion.targets import apply_targets
 
-__all__ = ["PathLosses", "class_losses", "gate_terms", "path_losses"]
+__all__ = ["PathLosses", "class_losses", "failure_loss", "gate_terms", "path_losses"]
 
 
 class PathLosses(NamedTuple):
@@ -86,6 +86,18 @@ def path_losses(
         balanced.append(even)
     counted = sample.positive.any(axis=1).astype(jnp.float32)
     return PathLosses(jnp.stack(whole, 1), jnp.stack(balanced, 1), counted)
+
+
+def failure_loss(
+    logits: Float[Array, "b 2"], failed: Bool[Array, "b 2"] | None
+) -> Float[Array, ""]:
+    """Mean cross entropy of the told failures (log odds); 0 without labels or without a teller."""
+    if failed is None:
+        return jnp.zeros(())
+    known = jnp.isfinite(logits)
+    safe = jnp.where(known, logits, 0.0)
+    losses = jax.nn.softplus(safe) - safe * failed.astype(safe.dtype)
+    return jnp.mean(jnp.where(known, losses, 0.0))
 
 
 def gate_terms(

@@ -35,8 +35,8 @@ def detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Det
     proposals, found = propose_boxes(config, main, encoded, scale, inputs, config.proposals)
     scores, moves, angle = score_proposals(config, main, encoded, scale, inputs, proposals).outputs
     boxes = jax.vmap(decode_second)(proposals, moves, angle, inputs.plane)
-    return jax.vmap(lambda b, s, m, w: final_boxes(config, b, s, m, w))(
-        boxes, scores, found, encoded.weights
+    return jax.vmap(lambda b, s, m, w, f: final_boxes(config, b, s, m, w, f))(
+        boxes, scores, found, encoded.weights, encoded.failed
     )
 
 

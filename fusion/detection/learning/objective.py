@@ -16,7 +16,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, PRNGKeyArray
+from jaxtyping import Array, Bool, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import (
@@ -31,6 +31,7 @@ from fusion.detection.learning.detection_loss import regression_loss
 from fusion.detection.learning.gate_objective import (
     PathLosses,
     class_losses,
+    failure_loss,
     gate_terms,
     path_losses,
 )
@@ -60,6 +61,7 @@ class DetectorLoss(NamedTuple):
         rpn_classes, rpn_boxes: first stage.
         classes, boxes, angle: second stage.
         auxiliary, regularization: of the gate; 0 for `avod`.
+        failure: cross entropy of the failures that the gate tells; 0 where it tells none.
         rpn_positives, positives: boxes that are objects in the mini-batches, per frame.
         weights: `[b, 2]` fusion weights of the frames.
     """
@@ -72,6 +74,7 @@ class DetectorLoss(NamedTuple):
     angle: Array
     auxiliary: Array
     regularization: Array
+    failure: Array
     rpn_positives: Array
     positives: Array
     weights: Array
@@ -119,6 +122,7 @@ def detector_loss(
     params: Any,
     stats: Any,
     inputs: Inputs,
+    failed: Bool[Array, "b 2"] | None = None,
     *,
     key: PRNGKeyArray,
 ) -> tuple[Array, tuple[DetectorLoss, Any]]:
@@ -133,6 +137,7 @@ def detector_loss(
         params: of `init_detector`; differentiable.
         stats: of batch norm.
         inputs: batch of frames.
+        failed: which of (camera, lidar) failed in each frame, if that is known.
         key: of mini-batches, dropout and path drop.
     """
     c, b = config, inputs.image.shape[0]
@@ -160,7 +165,7 @@ def detector_loss(
     rpn_boxes = jax.vmap(regression_loss)(offsets, target, sample)
     paths: list[PathLosses] = []
     heads: Any = AuxiliaryHeads(c)
-    if c.model == "avod_argate":
+    if c.gated:
         auxiliary = {"params": params["auxiliary"]}
         outputs = heads.apply(auxiliary, crops, True, method="first_stage", rngs={"dropout": drop2})
         paths.append(path_losses(c, outputs, (target,), sample))
@@ -185,7 +190,7 @@ def detector_loss(
     boxes = jax.vmap(regression_loss)(offsets, moves, sample2)
     angles = jax.vmap(regression_loss)(angle, heading, sample2)
     gate = of_paths = regularization = jnp.zeros(())
-    if c.model == "avod_argate":
+    if c.gated:
         if c.auxiliary_second:
             outputs = heads.apply(
                 auxiliary, crops, True, method="second_stage", rngs={"dropout": drop4}
@@ -200,10 +205,11 @@ def detector_loss(
         + c.regression_weight * boxes
         + c.angle_weight * angles
     )
-    total = frames.mean() + gate
+    failure = failure_loss(encoded.failed, failed)
+    total = frames.mean() + gate + hyper.failure_label * failure
     terms = DetectorLoss(
         total, rpn_classes.mean(), rpn_boxes.mean(), classes.mean(), boxes.mean(), angles.mean(),
-        of_paths, regularization,
+        of_paths, regularization, failure,
         sample.positive.sum(axis=1).astype(jnp.float32).mean(),
         sample2.positive.sum(axis=1).astype(jnp.float32).mean(),
         encoded.weights,

@@ -21,6 +21,7 @@ class _Fields(NamedTuple):
     l2_dense: Number = 5e-3
     clip_norm: Number = 10.0
     target_rate: Number = 10.0
+    failure_label: Number = 1.0
     gate: LossParams = LossParams(alpha=1.0, beta=10.0, tau=0.1, anchor=30.0)
 
 
@@ -36,6 +37,8 @@ class DetectorParams(_Fields):
         clip_norm: bound of the gradient's norm, lattice aside.
         target_rate: factor of the learning rate for the lattice of the targets, a few numbers that
             have to keep up with the losses of the paths.
+        failure_label: weight of the cross entropy between the failure that was simulated in a
+            training frame and the one that the gate tells; 0 leaves the label unused.
         gate: alpha, beta, tau and the anchor of Equation 3.2, see `fusion.losses`.
 
     Raises:
@@ -55,7 +58,7 @@ class DetectorParams(_Fields):
             value = getattr(made, name)
             if isinstance(value, float | int) and not 0 < value < float("inf"):
                 raise ValueError(f"{name}={value}: expected a finite number above 0")
-        for name in ("l2", "l2_dense"):
+        for name in ("l2", "l2_dense", "failure_label"):
             value = getattr(made, name)
             if isinstance(value, float | int) and not 0 <= value < float("inf"):
                 raise ValueError(f"{name}={value}: expected a finite number of at least 0")

@@ -14,10 +14,11 @@ import optax
 from jaxtyping import Array, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
+from fusion.detection.learning.dense_objective import dense_loss
 from fusion.detection.learning.examples import Example, frame_depth, make_inputs
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
 from fusion.detection.learning.params import DetectorParams
-from fusion.detection.network.detector import init_detector
+from fusion.detection.network.build import init_detector
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.sensors.camera_failures import (
     CAMERA_FAILURES,
@@ -259,9 +260,10 @@ def train_step(
     inputs, failed = jax.lax.map(
         lambda a: training_inputs(config, train, a[1], key=a[0]), (keys, batch)
     )
-    gradient = jax.value_and_grad(detector_loss, argnums=2, has_aux=True)
+    loss = dense_loss if config.is_dense else detector_loss
+    gradient = jax.value_and_grad(loss, argnums=2, has_aux=True)
     (_, (terms, stats)), grads = gradient(
-        config, hyper, state.params, state.stats, inputs, key=loss_key
+        config, hyper, state.params, state.stats, inputs, failed, key=loss_key
     )
     decayed = jax.tree.map(lambda g, p, d: g + d * p, grads, state.params, _l2(hyper, grads))
     updates, opt_state = _optimizer(hyper).update(decayed, state.opt_state, state.params)

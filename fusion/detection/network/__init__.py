@@ -1,15 +1,22 @@
 """The two-stage detector as flax modules, and the way through it."""
 
+from fusion.detection.network.build import count_main_parameters, init_detector
 from fusion.detection.network.convolution import convolve
 from fusion.detection.network.crop import crop_and_resize
+from fusion.detection.network.dense import (
+    N_OUTPUTS,
+    DenseAuxiliary,
+    DenseDetector,
+    Grids,
+    init_dense,
+)
 from fusion.detection.network.detector import (
     AuxiliaryHeads,
     Detector,
     Encoded,
-    count_main_parameters,
     crop_views,
     fuse,
-    init_detector,
+    init_avod,
 )
 from fusion.detection.network.forward import (
     Scored,
@@ -19,9 +26,10 @@ from fusion.detection.network.forward import (
     score_proposals,
 )
 from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
-from fusion.detection.network.heads import MapGate, RpnHead, SecondHead
+from fusion.detection.network.heads import GridGate, MapGate, QualityHead, RpnHead, SecondHead
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.inputs import Inputs
+from fusion.detection.network.lift import grid_centres, lift
 from fusion.detection.network.proposals import (
     Detections,
     anchor_boxes,
@@ -34,13 +42,19 @@ from fusion.detection.network.views import FeaturePyramid, TransposedConv
 
 __all__ = [
     "GROUP_SIZE",
+    "N_OUTPUTS",
     "AuxiliaryHeads",
+    "DenseAuxiliary",
+    "DenseDetector",
     "Detections",
     "Detector",
     "Encoded",
     "FeaturePyramid",
+    "GridGate",
+    "Grids",
     "Inputs",
     "MapGate",
+    "QualityHead",
     "RpnHead",
     "Scored",
     "SecondHead",
@@ -54,9 +68,13 @@ __all__ = [
     "encode",
     "final_boxes",
     "fuse",
+    "grid_centres",
     "group_norm_relu",
+    "init_avod",
+    "init_dense",
     "init_detector",
     "init_weights",
+    "lift",
     "propose",
     "propose_boxes",
     "score_anchors",

@@ -16,25 +16,28 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.network.crop import crop_and_resize
-from fusion.detection.network.heads import MapGate, RpnHead, SecondHead
+from fusion.detection.network.heads import MapGate, QualityHead, RpnHead, SecondHead
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.views import FeaturePyramid
+from fusion.detection.sensors.quality import quality_statistics
 from fusion.targets import init_targets
 
 __all__ = [
     "AuxiliaryHeads",
     "Detector",
     "Encoded",
-    "count_main_parameters",
     "crop_views",
     "fuse",
-    "init_detector",
+    "init_avod",
 ]
 
 SENSORS = ("camera", "lidar")
 # Output layers start small: even class scores, boxes at their anchors. The gate's starts at zero,
 # so that training starts from equal weights, as AVOD fuses.
-_OUTPUTS = {"objectness": 0.01, "offsets": 0.01, "classes": 0.01, "angle": 0.01, "fusion": 0.0}
+_OUTPUTS = {
+    "objectness": 0.01, "offsets": 0.01, "classes": 0.01, "angle": 0.01, "failed": 0.01,
+    "fusion": 0.0,
+}  # fmt: skip
 
 
 class Encoded(NamedTuple):
@@ -44,11 +47,13 @@ class Encoded(NamedTuple):
         features: two arrays `[b, h, w, f]`.
         maps: two arrays `[b, h, w, 1]`.
         weights: `[b, 2]`, sum to one.
+        failed: `[b, 2]` log odds that the sensor has failed; NaN without a gate that tells.
     """
 
     features: tuple[Array, Array]
     maps: tuple[Array, Array]
     weights: Array
+    failed: Array
 
 
 class Detector(nn.Module):
@@ -63,8 +68,10 @@ class Detector(nn.Module):
             FeaturePyramid(c.widths, c.layers, c.norm, name=f"{sensor}_view") for sensor in SENSORS
         ]
         self.reduce = [nn.Conv(1, (1, 1), name=f"{sensor}_map") for sensor in SENSORS]
-        if c.model == "avod_argate":
+        if c.gated:
             self.gate = MapGate(c.gate_width, c.normalizer)
+            if c.gate_statistics:
+                self.quality = QualityHead(c.gate_width)
         self.rpn = RpnHead(c.rpn_width, c.dropout)
         self.second = SecondHead(c.fc_widths, c.dropout)
 
@@ -75,11 +82,14 @@ class Detector(nn.Module):
         camera = _teach_if_alive(self.views[0](image, train), image)
         lidar = _teach_if_alive(self.views[1](bev, train), bev)
         maps = (nn.relu(self.reduce[0](camera)), nn.relu(self.reduce[1](lidar)))
-        if self.config.model == "avod_argate":
-            weights = self.gate(maps)
-        else:
-            weights = jnp.full((image.shape[0], 2), 0.5)
-        return Encoded((camera, lidar), maps, weights)
+        failed = jnp.full((image.shape[0], 2), jnp.nan)
+        if not self.config.gated:
+            return Encoded((camera, lidar), maps, jnp.full((image.shape[0], 2), 0.5), failed)
+        if not self.config.gate_statistics:
+            return Encoded((camera, lidar), maps, self.gate(maps), failed)
+        statistics = quality_statistics(self.config.bev, image, bev)
+        failed = self.quality(statistics)
+        return Encoded((camera, lidar), maps, self.gate(maps, statistics, failed), failed)
 
     def first_stage(self, crops: Array, train: bool) -> tuple[Array, Array]:
         """`RpnHead` on fused crops of the one-channel maps."""
@@ -156,7 +166,7 @@ def fuse(crops: tuple[Array, Array], scale: Float[Array, "b 2"]) -> Array:
     return factor[:, 0] * crops[0] + factor[:, 1] * crops[1]
 
 
-def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
+def init_avod(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
     """Fresh parameters and the statistics of batch norm (empty with group norm).
 
     Parameters are `main` and, for `avod_argate`, those that training alone needs: `auxiliary`
@@ -170,7 +180,7 @@ def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
     image, bev = shape(*config.image_size, 3), shape(*config.bev.shape, config.bev.n_slices + 1)
     variables = init_weights(main_key, Detector(config), image, bev, scales=_OUTPUTS)
     params: dict[str, Any] = {"main": variables["params"]}
-    if config.model == "avod_argate":
+    if config.gated:
         first = shape(config.rpn_crop, config.rpn_crop, 1)
         second = shape(config.second_crop, config.second_crop, config.widths[0])
         heads = init_weights(
@@ -180,9 +190,3 @@ def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
         params["targets"] = init_targets(target_key, config.targets, 2)
         params["mean_losses"] = jnp.full(2, math.log(2.0), jnp.float32)
     return params, variables.get("batch_stats", {})
-
-
-def count_main_parameters(config: DetectorConfig) -> int:
-    """Parameters that inference uses, without making them."""
-    shapes = jax.eval_shape(lambda: init_detector(jax.random.key(0), config)[0]["main"])
-    return sum(leaf.size for leaf in jax.tree.leaves(shapes))

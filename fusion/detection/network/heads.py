@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 import flax.linen as nn
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from fusion.gating import Normalizer, normalize
 
-__all__ = ["MapGate", "RpnHead", "SecondHead"]
+__all__ = ["GridGate", "MapGate", "QualityHead", "RpnHead", "SecondHead"]
 
 _LEAK = 0.1
 
@@ -41,24 +42,44 @@ class RpnHead(nn.Module):
         return outputs[0], outputs[1]
 
 
-class MapGate(nn.Module):
-    r"""Fusion weights of a frame from the one-channel map of each view.
+class QualityHead(nn.Module):
+    """Logits of each sensor's failure from the statistics of the raw readings."""
 
-    .. math:: w = N\Big(W_o \, \mathrm{lrelu}\big(\textstyle\sum_k W_k p_k + b_k\big) + b_o\Big)
+    width: int
+
+    @nn.compact
+    def __call__(self, statistics: Float[Array, "b n"]) -> Float[Array, "b 2"]:
+        """Log odds that (camera, lidar) has failed."""
+        hidden = nn.leaky_relu(nn.Dense(self.width, name="quality")(statistics), _LEAK)
+        return nn.Dense(2, name="failed")(hidden)
+
+
+class MapGate(nn.Module):
+    r"""Fusion weights of a frame from the one-channel map of each view and the raw readings.
+
+    .. math:: w = N\Big(W_o \, \big[\mathrm{lrelu}\big(\textstyle\sum_k W_k p_k + b_k + W_q q\big),
+        \ell\big] + b_o\Big)
 
     :math:`p_k` are mean and standard deviation over the map of view k after two strided
-    convolutions, :math:`N` the normalizer; rectifiers are leaky, since a gate whose few units have
-    died weighs all frames alike. `init_detector` starts the last layer at zero, that is from equal
-    weights, as AVOD fuses.
+    convolutions, :math:`q` the statistics of the raw readings (`quality_statistics`),
+    :math:`\ell` the log odds of failures that `QualityHead` reads from them, :math:`N` the
+    normalizer; rectifiers are leaky, since a gate whose few units have died weighs all frames
+    alike. `init_detector` starts the last layer at zero, that is from equal weights, as AVOD fuses.
 
     Source: Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
+    Deviation: the statistics; normalized maps do not hold what a failure changes most.
     """
 
     width: int
     normalizer: Normalizer
 
     @nn.compact
-    def __call__(self, maps: tuple[Array, ...]) -> Float[Array, "b k"]:
+    def __call__(
+        self,
+        maps: tuple[Array, ...],
+        statistics: Float[Array, "b n"] | None = None,
+        failed: Float[Array, "b k"] | None = None,
+    ) -> Float[Array, "b k"]:
         """Weights of the views for every frame."""
         hidden = jnp.zeros((maps[0].shape[0], self.width))
         for k, x in enumerate(maps):
@@ -68,8 +89,40 @@ class MapGate(nn.Module):
             spread = jnp.sqrt(x.var(axis=(1, 2)) + 1e-6)
             pooled = jnp.concatenate([x.mean(axis=(1, 2)), spread], axis=-1)
             hidden = hidden + nn.Dense(self.width, name=f"view{k}")(pooled)
+        if statistics is not None:
+            hidden = hidden + nn.Dense(self.width, name="statistics")(statistics)
+        hidden = nn.leaky_relu(hidden, _LEAK)
+        if failed is not None:
+            hidden = jnp.concatenate([hidden, jax.lax.stop_gradient(failed)], axis=-1)
         last = nn.Dense(len(maps), name="fusion")
-        return normalize(last(nn.leaky_relu(hidden, _LEAK)), self.normalizer)
+        return normalize(last(hidden), self.normalizer)
+
+
+class GridGate(nn.Module):
+    """Fusion weights from the views' grids over the ground, as `MapGate` from its maps.
+
+    Grids of many channels need no convolutions of their own: mean and deviation of each channel.
+    """
+
+    width: int
+    normalizer: Normalizer
+
+    @nn.compact
+    def __call__(
+        self,
+        grids: tuple[Array, ...],
+        statistics: Float[Array, "b n"] | None = None,
+        failed: Float[Array, "b k"] | None = None,
+    ) -> Float[Array, "b k"]:
+        """Weights of the views for every frame."""
+        parts = [x.mean(axis=(1, 2)) for x in grids]
+        parts += [jnp.sqrt(x.var(axis=(1, 2)) + 1e-6) for x in grids]
+        parts += [] if statistics is None else [statistics]
+        hidden = nn.Dense(self.width, name="views")(jnp.concatenate(parts, axis=-1))
+        hidden = nn.leaky_relu(hidden, _LEAK)
+        if failed is not None:
+            hidden = jnp.concatenate([hidden, jax.lax.stop_gradient(failed)], axis=-1)
+        return normalize(nn.Dense(len(grids), name="fusion")(hidden), self.normalizer)
 
 
 class SecondHead(nn.Module):

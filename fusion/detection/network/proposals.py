@@ -39,12 +39,14 @@ class Detections(NamedTuple):
         scores: `[k]` probability of an object.
         mask: `[k]` which rows are detections.
         weights: `[2]` fusion weights of (camera, lidar).
+        failed: `[2]` probability that each of them has failed; NaN where the gate does not tell.
     """
 
     boxes: Array
     scores: Array
     mask: Array
     weights: Array
+    failed: Array
 
 
 def anchor_boxes(anchors: Float[Array, "n 6"]) -> Float[Array, "n 7"]:
@@ -110,8 +112,12 @@ def final_boxes(
     scores: Float[Array, "k 2"],
     mask: Bool[Array, "k"],
     weights: Float[Array, "2"],
+    failed: Float[Array, "2"],
 ) -> Detections:
-    """Probabilities, suppression on the ground, and the boxes above the score threshold."""
+    """Probabilities, suppression on the ground, and the boxes above the score threshold.
+
+    `failed` are log odds.
+    """
     probability = jax.nn.softmax(scores, axis=-1)[:, 1]
     sound = (boxes[:, 3:6] > 0.0).all(axis=1) & jnp.isfinite(boxes).all(axis=1)
     index, found = nms(
@@ -122,4 +128,10 @@ def final_boxes(
         max_output=config.max_detections,
         max_candidates=boxes.shape[0],
     )
-    return Detections(boxes[index], jnp.where(found, probability[index], 0.0), found, weights)
+    return Detections(
+        boxes[index],
+        jnp.where(found, probability[index], 0.0),
+        found,
+        weights,
+        jax.nn.sigmoid(failed),
+    )

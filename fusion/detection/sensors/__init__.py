@@ -14,6 +14,13 @@ from fusion.detection.sensors.lidar_failures import (
     lidar_failure,
     random_lidar_failure,
 )
+from fusion.detection.sensors.quality import (
+    N_IMAGE,
+    N_SCAN,
+    image_statistics,
+    quality_statistics,
+    scan_statistics,
+)
 from fusion.detection.sensors.severity import Severity, check_failure
 
 __all__ = [
@@ -23,6 +30,8 @@ __all__ = [
     "FARTHEST",
     "LIDAR_FAILURES",
     "N_BEAMS",
+    "N_IMAGE",
+    "N_SCAN",
     "RANGE_NOISE",
     "CameraFailure",
     "LidarFailure",
@@ -31,7 +40,10 @@ __all__ = [
     "camera_failure",
     "check_failure",
     "depth_image",
+    "image_statistics",
     "lidar_failure",
+    "quality_statistics",
     "random_camera_failure",
     "random_lidar_failure",
+    "scan_statistics",
 ]

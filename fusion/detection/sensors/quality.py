@@ -1,0 +1,116 @@
+r"""Plain statistics of the raw readings, from which a gate can tell that a sensor fails.
+
+Feature maps after normalization no longer hold what a failure changes most: level, contrast, the
+number of points. These are some fifty numbers of the picture and of the map, all of the order of 1:
+means and deviations, gradients, a histogram and its entropy, contrast of blocks; occupied cells by
+bearing and by depth, isolated ones, mean height and density.
+
+Source: statistics of natural scenes as measures of quality, Mittal, Moorthy, Bovik (2012); which of
+them is our choice.
+"""
+
+from __future__ import annotations
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+from jaxtyping import Array, Float
+
+from fusion.detection.geometry.bev import BevConfig
+
+__all__ = ["N_IMAGE", "N_SCAN", "image_statistics", "quality_statistics", "scan_statistics"]
+
+_LEVELS = np.linspace(-0.4, 0.6, 9, dtype=np.float32)  # of grey, mean colour subtracted
+_BLOCKS = 8  # rows and columns of blocks
+_SECTORS, _BANDS = 8, 6
+N_IMAGE = 3 + 3 + 4 + len(_LEVELS) + 1 + 4
+N_SCAN = _SECTORS + _BANDS + 8
+
+
+def _log(x: Array) -> Array:
+    """Logarithm of a share or variance, scaled to the order of 1."""
+    return 0.3 * (jnp.log(x + 1e-5) + 4.0)
+
+
+def _spread(x: Array) -> Array:
+    """Mean, deviation, least and largest of the last axis."""
+    deviation = jnp.sqrt(x.var(axis=-1) + 1e-8)
+    return jnp.stack([x.mean(axis=-1), deviation, x.min(axis=-1), x.max(axis=-1)], axis=-1)
+
+
+def image_statistics(image: Float[Array, "b h w 3"]) -> Float[Array, "b n"]:
+    """`N_IMAGE` statistics of pictures, mean colour subtracted."""
+    b, height, width, _ = image.shape
+    grey = image.mean(axis=-1)
+    along, down = jnp.abs(jnp.diff(grey, axis=2)), jnp.abs(jnp.diff(grey, axis=1))
+    bend = jnp.abs(jnp.diff(grey, 2, axis=2))
+    flat = (along < 1e-3).astype(grey.dtype)  # nothing changes from pixel to pixel
+    gradients = [_log(x.mean(axis=(1, 2))) for x in (along, down, bend, flat)]
+    level = grey.reshape(b, 1, -1) - jnp.asarray(_LEVELS)[None, :, None]
+    histogram = jnp.exp(-0.5 * (level / 0.08) ** 2).mean(axis=-1)
+    share = histogram / (histogram.sum(axis=-1, keepdims=True) + 1e-6)
+    entropy = -(share * jnp.log(share + 1e-6)).sum(axis=-1, keepdims=True)
+    rows, columns = height // _BLOCKS, max(1, width // _BLOCKS)
+    blocks = grey[:, : _BLOCKS * rows, : _BLOCKS * columns]
+    blocks = blocks.reshape(b, _BLOCKS, rows, _BLOCKS, columns)
+    contrast = _log(blocks.var(axis=(2, 4)).reshape(b, -1))
+    colour = image.reshape(b, -1, 3)
+    return jnp.concatenate(
+        [
+            3.0 * colour.mean(axis=1),
+            5.0 * jnp.sqrt(colour.var(axis=1) + 1e-8),
+            jnp.stack(gradients, axis=-1),
+            3.0 * histogram,
+            entropy,
+            _spread(contrast),
+        ],
+        axis=-1,
+    )
+
+
+def _parts(config: BevConfig) -> tuple[np.ndarray, np.ndarray]:
+    """`[cells, sectors]` and `[cells, bands]`: which bearing and depth every cell belongs to."""
+    rows, columns = config.shape
+    row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
+    z = config.z_range[1] - (row + 0.5) * config.cell
+    x = config.x_range[0] + (column + 0.5) * config.cell
+    bearing = np.arctan2(x, np.maximum(z, 1e-3)).ravel()
+    edges = np.quantile(bearing, np.linspace(0, 1, _SECTORS + 1)[1:-1])
+    sector = np.searchsorted(edges, bearing)
+    band = row.ravel() * _BANDS // rows
+    return np.eye(_SECTORS, dtype=np.float32)[sector], np.eye(_BANDS, dtype=np.float32)[band]
+
+
+def scan_statistics(config: BevConfig, bev: Float[Array, "b r c s"]) -> Float[Array, "b n"]:
+    """`N_SCAN` statistics of bird's-eye maps, whose last channel is the density."""
+    b = bev.shape[0]
+    occupied = (bev[..., -1] > 0).astype(bev.dtype)
+    cells = occupied.reshape(b, -1)
+    sectors, bands = (jnp.log1p(cells @ jnp.asarray(part)) / 5.0 for part in _parts(config))
+    total = occupied.sum(axis=(1, 2))
+    around = jax.lax.reduce_window(occupied, 0.0, jax.lax.add, (1, 3, 3), (1, 1, 1), "SAME")
+    around = around - occupied
+    whole = total + 1.0
+    filled = (bev[..., :-1] > 0).astype(bev.dtype).sum(axis=-1)
+    of_all = jnp.stack(
+        [
+            jnp.log1p(total) / 7.0,
+            jnp.where(around == 0, occupied, 0.0).sum(axis=(1, 2)) / whole,
+            (occupied * around).sum(axis=(1, 2)) / whole / 4.0,
+            bev[..., -1].sum(axis=(1, 2)) / whole,
+            (filled * occupied).sum(axis=(1, 2)) / whole,
+            jnp.sqrt(sectors.var(axis=-1) + 1e-8),
+            sectors.min(axis=-1),
+            jnp.sqrt(bands.var(axis=-1) + 1e-8),
+        ],
+        axis=-1,
+    )
+    return jnp.concatenate([sectors, bands, of_all], axis=-1)
+
+
+def quality_statistics(
+    config: BevConfig, image: Float[Array, "b h w 3"], bev: Float[Array, "b r c s"]
+) -> Float[Array, "b n"]:
+    """Statistics of both sensors, the camera's first; without gradient."""
+    both = [image_statistics(image), scan_statistics(config, bev)]
+    return jax.lax.stop_gradient(jnp.concatenate(both, axis=-1))

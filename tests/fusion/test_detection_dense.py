@@ -1,0 +1,119 @@
+"""The one-stage detector: grid, targets and their inverse, parameters, a few steps in the loop."""
+
+from __future__ import annotations
+
+import dataclasses
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fusion.detection.config import DenseConfig, DetectorConfig
+from fusion.detection.geometry.bev import BevConfig
+from fusion.detection.learning.dense_objective import grid_losses
+from fusion.detection.learning.dense_targets import GridTargets, decode_cells, grid_targets
+from fusion.detection.learning.examples import make_example
+from fusion.detection.learning.fitting import fit_detector, run_detector
+from fusion.detection.learning.params import DetectorParams
+from fusion.detection.learning.training import DetectorTrainConfig
+from fusion.detection.network.build import count_main_parameters
+from fusion.detection.network.lift import grid_centres, lift
+from fusion.detection.presets import preset
+from fusion.targets import check_targets
+from tests.fusion.test_detection_network import a_frame
+
+TINY = preset("tiny", "dense_argate").config
+PLANE = jnp.array([0.0, -1.0, 0.0, 1.6])
+
+
+def test_cells_lie_as_the_map_does() -> None:
+    x, z = grid_centres(TINY)
+    assert x.shape == z.shape == (32, 32)
+    assert (x[0, 0], z[0, 0], x[-1, -1], z[-1, -1]) == (-7.75, 19.75, 7.75, 4.25)
+    with pytest.raises(ValueError, match=r"cell=0\.75: expected a multiple of the map's 0\.5 m"):
+        dataclasses.replace(TINY, dense=DenseConfig(cell=0.75))
+    with pytest.raises(ValueError, match="expected multiples of 4"):
+        DenseConfig(lidar_width=6)
+    with pytest.raises(ValueError, match="divides its 31 x 32 cells"):
+        area = BevConfig(x_range=(-8.0, 8.0), z_range=(4.5, 20.0), cell=0.5)
+        DetectorConfig(model="dense", bev=area, dense=DenseConfig(cell=1.0))
+
+
+def test_lifted_features_are_those_of_the_projected_cells() -> None:
+    rows, columns = 16, 48
+    u, v = jnp.meshgrid(jnp.linspace(0, 1, columns), jnp.linspace(0, 1, rows))
+    p2 = jnp.array([[70.0, 0, 48, 0], [0, 70, 16, 0], [0, 0, 1, 0]])
+    size = jnp.array([32.0, 96.0])
+    got = jax.jit(partial(lift, TINY))(jnp.stack([u, v], axis=-1), PLANE, p2, size)
+    assert got.shape == (32, 32, 6)
+    x, z = grid_centres(TINY)
+    for k, above in enumerate(TINY.dense.heights):
+        wanted_u = (70 * x / z + 48) / 95
+        wanted_v = (70 * (1.6 - above) / z + 16) / 31
+        inside = (wanted_u >= 0) & (wanted_u <= 1) & (wanted_v >= 0) & (wanted_v <= 1)
+        assert 100 < inside.sum() < inside.size
+        np.testing.assert_allclose(got[..., 2 * k][inside], wanted_u[inside], atol=1e-4)
+        np.testing.assert_allclose(got[..., 2 * k + 1][inside], wanted_v[inside], atol=1e-4)
+        assert float(jnp.abs(got[..., 2 * k][~inside]).max()) == 0.0
+
+
+def test_targets_decode_to_the_labels() -> None:
+    truth = jnp.array([[-2.4, 1.5, 9.4, 4.2, 1.7, 1.5, 0.3], [3.4, 1.6, 14.6, 3.6, 1.6, 1.4, -2.0],
+                       [0.0, 0, 0, 1, 1, 1, 0]])  # fmt: skip
+    mask = jnp.array([True, True, False])
+    got = jax.jit(partial(grid_targets, TINY))(truth, mask, PLANE)
+    assert int(got.centre.sum()) == 2 and float(got.heat.max()) == 1.0
+    assert 8 < int(got.near.sum()) < 30 and float(got.heat[0, 0]) < 1e-6
+    boxes = decode_cells(TINY, got.boxes, PLANE)
+    for i in range(2):
+        column, row = int((truth[i, 0] + 8) / 0.5), int((20 - truth[i, 2]) / 0.5)
+        assert bool(got.centre[row, column])
+        np.testing.assert_allclose(boxes[row * 32 + column], truth[i], atol=1e-4)
+    none = grid_targets(TINY, truth, jnp.zeros(3, bool), PLANE)
+    assert float(none.heat.max()) == 0.0 and not bool(none.near.any())
+
+
+def test_losses_by_hand() -> None:
+    heat = jnp.array([[[1.0, 0.5], [0.0, 0.0]]])
+    centre = heat == 1.0
+    targets = GridTargets(heat, centre, centre, jnp.zeros((1, 2, 2, 8)))
+    outputs = jnp.zeros((1, 2, 2, 9)).at[0, 0, 0, 1].set(2.0)
+    got = grid_losses(outputs, targets)
+    # Heat 0.5 everywhere: 1/4 log 2 for the centre and for cold cells, a 16th of it beside it.
+    np.testing.assert_allclose(got[0], 0.25 * np.log(2) * (1 + 2 + 0.5**4), rtol=1e-5)
+    np.testing.assert_allclose(got[1], 1.5, rtol=1e-6)
+    np.testing.assert_allclose(got[2], np.log(2), rtol=1e-5)
+
+
+def test_the_gate_adds_less_than_two_percent() -> None:
+    for size in ("paper", "small"):
+        plain, gated = (
+            count_main_parameters(preset(size, m).config) for m in ("dense", "dense_argate")
+        )
+        assert plain < gated < 1.02 * plain
+
+
+@pytest.mark.relaxed
+def test_it_is_trained_by_the_same_loop() -> None:
+    example, _ = make_example(TINY, a_frame())
+    train = DetectorTrainConfig(
+        steps=30, batch_size=2, schedule="cosine", failure_share=0.5, flip=False,
+        failure_kinds=("camera_noise", "lidar_loss"),
+    )  # fmt: skip
+    rates = DetectorParams(learning_rate=1e-2, l2=0.0, l2_dense=0.0, clip_norm=5.0)
+    fitted = fit_detector(TINY, train, rates, 3, lambda i: example, seed=1, report_every=10)
+    first, last = fitted.history[0], fitted.history[-1]
+    assert np.isfinite(list(last.values())).all()
+    assert last["classes"] < 0.7 * first["classes"] and last["boxes"] < first["boxes"]
+    assert first["positives"] == 2.0 and last["auxiliary"] < first["auxiliary"]
+    assert float(check_targets(TINY.targets, fitted.state.params["targets"])) == 0.0
+    config = dataclasses.replace(TINY, score_threshold=0.0)
+    (found,) = run_detector(config, fitted.state, [example])
+    assert found.boxes.shape == (4, 7) and found.mask.any() and np.isfinite(found.boxes).all()
+    np.testing.assert_allclose(found.weights.sum(), 1.0, rtol=1e-5)
+    assert ((found.failed > 0) & (found.failed < 1)).all()
+    assert (np.diff(found.scores[found.mask]) <= 0).all()
+    (dead,) = run_detector(config, fitted.state, [example], failure="lidar_loss")
+    assert not np.array_equal(dead.scores, found.scores)

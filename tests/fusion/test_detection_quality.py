@@ -1,0 +1,109 @@
+"""Statistics of raw readings tell a failing sensor from a working one, kind by kind."""
+
+from __future__ import annotations
+
+from functools import partial
+
+import jax
+import jax.numpy as jnp
+import numpy as np
+import pytest
+
+from fusion.detection.geometry import BevConfig, bev_maps
+from fusion.detection.learning.gate_objective import failure_loss
+from fusion.detection.sensors import (
+    CAMERA_FAILURES,
+    LIDAR_FAILURES,
+    N_IMAGE,
+    N_SCAN,
+    camera_failure,
+    image_statistics,
+    lidar_failure,
+    quality_statistics,
+    scan_statistics,
+)
+from fusion.detection.sensors.hdl64 import ELEVATIONS
+from fusion.evaluate import auroc
+
+N = 48
+BEV = BevConfig(x_range=(-16.0, 16.0), z_range=(2.0, 34.0), cell=0.5)
+PLANE = jnp.array([0.0, -1.0, 0.0, 1.7])
+DEPTH = jnp.asarray(np.minimum(60.0, 8.0 + 0.0 * np.zeros((32, 96))), jnp.float32)
+
+
+def pictures(rng: np.random.Generator) -> np.ndarray:
+    """Blocks of random colours, by day and in shade."""
+    blocks = rng.uniform(0.1, 0.9, (N, 8, 24, 3)).repeat(4, axis=1).repeat(4, axis=2)
+    light = rng.uniform(0.5, 1.0, (N, 1, 1, 1))
+    return np.clip(light * blocks + rng.normal(0, 0.01, blocks.shape), 0, 1).astype(np.float32)
+
+
+def scans(rng: np.random.Generator) -> np.ndarray:
+    """A road and some walls, 64 beams by 90 azimuths in front; `[N, 5760, 4]`."""
+    azimuth, elevation = np.meshgrid(np.radians(np.linspace(-40, 40, 90)), ELEVATIONS)
+    found = []
+    for _ in range(N):
+        wall = rng.uniform(8, 30, 10).repeat(9)[None]
+        road = 1.7 / np.maximum(np.tan(-elevation), 1e-3)
+        distance = np.minimum(np.minimum(wall, road), 60.0) * rng.normal(1, 0.001, azimuth.shape)
+        unit = np.stack([np.cos(azimuth), np.sin(azimuth), np.tan(elevation)], axis=-1)
+        points = (distance[..., None] * unit).reshape(-1, 3)
+        found.append(np.concatenate([points, np.full((len(points), 1), 0.3)], axis=1))
+    return np.asarray(found, np.float32)
+
+
+def told(clean: np.ndarray, failed: np.ndarray) -> float:
+    """AUROC, on the second half, of a ridge regression fitted on the first half."""
+    half = N // 2
+    x = np.concatenate([clean[:half], failed[:half]]).astype(np.float64)
+    mean, sd = x.mean(0), x.std(0) + 1e-3
+    x, y = (x - mean) / sd, np.repeat([-1.0, 1.0], half)
+    weights = np.linalg.solve(x.T @ x + 3.0 * np.eye(x.shape[1]), x.T @ y)
+    score = [(part[half:] - mean) / sd @ weights for part in (failed, clean)]
+    return auroc(*score)
+
+
+@pytest.mark.parametrize("kind", CAMERA_FAILURES)
+def test_pictures_of_a_failing_camera_are_told(kind: str) -> None:
+    images = jnp.asarray(pictures(np.random.default_rng(0)))
+    keys = jax.random.split(jax.random.key(0), N)
+
+    @jax.jit
+    def run(images: jax.Array) -> tuple[jax.Array, jax.Array]:
+        fail = partial(camera_failure, kind=kind, severity=jnp.float32(0.5), depth=DEPTH)
+        failed = jax.vmap(lambda image, key: fail(image, key=key))(images, keys)
+        return image_statistics(images - 0.37), image_statistics(failed - 0.37)
+
+    clean, failed = (np.asarray(part) for part in run(images))
+    assert clean.shape == (N, N_IMAGE) and np.isfinite(failed).all() and np.abs(failed).max() < 8
+    assert told(clean, failed) > 0.95
+
+
+@pytest.mark.parametrize("kind", LIDAR_FAILURES)
+def test_maps_of_a_failing_lidar_are_told(kind: str) -> None:
+    points = jnp.asarray(scans(np.random.default_rng(1)))
+    keys = jax.random.split(jax.random.key(0), N)
+    to_camera = jnp.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+
+    def statistics(points: jax.Array, mask: jax.Array) -> jax.Array:
+        bev = bev_maps(BEV, points[:, :3] @ to_camera.T, mask, PLANE)
+        return scan_statistics(BEV, bev[None])[0]
+
+    def one(points: jax.Array, key: jax.Array) -> tuple[jax.Array, jax.Array]:
+        mask = jnp.ones(points.shape[0], bool)
+        failed = lidar_failure(points, mask, kind, jnp.float32(0.7), key=key)
+        return statistics(points, mask), statistics(*failed)
+
+    clean, failed = (np.asarray(p) for p in jax.jit(jax.vmap(one))(points, keys))
+    assert clean.shape == (N, N_SCAN) and np.isfinite(failed).all() and np.abs(failed).max() < 8
+    assert told(clean, failed) > 0.95
+
+
+def test_statistics_pass_no_gradient_and_labels_count_where_they_are_known() -> None:
+    image, bev = jnp.ones((2, 32, 96, 3)), jnp.ones((2, *BEV.shape, 6))
+    slope = jax.grad(lambda x: quality_statistics(BEV, x, bev).sum())(image)
+    assert float(jnp.abs(slope).max()) == 0.0
+    logits, failed = jnp.array([[2.0, -1.0], [0.0, jnp.nan]]), jnp.array([[True, False]] * 2)
+    expected = (np.log1p(np.exp(-2.0)) + np.log1p(np.exp(-1.0)) + np.log(2)) / 4
+    np.testing.assert_allclose(failure_loss(logits, failed), expected, rtol=1e-5)
+    assert float(failure_loss(logits, None)) == 0.0

@@ -77,6 +77,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
     for name, detections in zip(names, objects, strict=True):
         write_results(out / "data" / f"{name}.txt", detections)
     weights = np.stack([d.weights for d in found])
+    failed = np.stack([d.failed for d in found])
     summary: dict[str, Any] = {
         "model": config.model,
         "split": config.split,
@@ -84,6 +85,9 @@ def evaluate(config: Eval) -> dict[str, Any]:
         "failure": config.failure,
         "detections": sum(len(o) for o in objects),
         "weight_camera": float(weights[:, 0].mean()),
+        # Mean probabilities, where the gate tells any.
+        "failed_camera": float(failed[:, 0].mean()) if np.isfinite(failed).all() else None,
+        "failed_lidar": float(failed[:, 1].mean()) if np.isfinite(failed).all() else None,
         # The first frame waits for the compiler.
         "seconds_per_frame": (clock[-1] - clock[0]) / (len(clock) - 1) if clock[1:] else None,
     }
@@ -106,6 +110,8 @@ def evaluate(config: Eval) -> dict[str, Any]:
         plot_bird(frame, best).savefig(out / f"{names[i]}_bird.png", dpi=120)
         plot_image(frame, best).savefig(out / f"{names[i]}_image.png", dpi=120)
     np.savetxt(out / "fusion_weights.txt", weights, fmt="%.6f", header="camera lidar")
+    if np.isfinite(failed).all():
+        np.savetxt(out / "failed.txt", failed, fmt="%.6f", header="camera lidar")
     write_json(out / "result.json", summary | {"provenance": provenance()})
     print(f"{len(names)} frames, result files and pictures in {out}")
     return summary

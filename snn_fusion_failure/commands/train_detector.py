@@ -165,7 +165,8 @@ def main(config: Prepare | Train | Eval | Robustness) -> dict[str, Any]:
         names = (
             "model", "split", "frames", "failure", "3d_moderate_r40", "bev_moderate_r40",
             "3d_moderate_r40_iou50", "3d_moderate_r11", "cap_moderate_r40", "detections",
-            "weight_camera", "weight_auroc", "seconds_per_frame",
+            "weight_camera", "failed_camera", "failed_lidar",
+            "weight_auroc", "seconds_per_frame",
         )  # fmt: skip
         shown = {k: result[k] for k in names if result.get(k) is not None}
     print_result(**shown)

@@ -78,7 +78,7 @@ def dense_loss(
     main = {"params": params["main"]}
     b = inputs.image.shape[0]
     grids: Grids = model.apply(main, inputs, method="encode")
-    kept = drop_modalities(key, jnp.ones((2, b, 1)), config.path_drop)[:, :, 0].T
+    kept = drop_modalities(jnp.ones((2, b, 1)), config.path_drop, key=key)[:, :, 0].T
     outputs = model.apply(main, grids, 2.0 * grids.weights * kept, method="head")
     targets = jax.vmap(lambda t, m, p: grid_targets(config, t, m, p))(
         inputs.truth, inputs.truth_mask, inputs.plane

@@ -17,6 +17,7 @@ from fusion.detection.network.detector import (
     crop_views,
     fuse,
     init_avod,
+    teach_if_alive,
 )
 from fusion.detection.network.forward import (
     Scored,
@@ -79,5 +80,6 @@ __all__ = [
     "propose_boxes",
     "score_anchors",
     "score_proposals",
+    "teach_if_alive",
     "view_boxes",
 ]

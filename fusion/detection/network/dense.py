@@ -21,6 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
+from fusion.detection.network.detector import teach_if_alive
 from fusion.detection.network.group_norm import group_norm_relu
 from fusion.detection.network.heads import GridGate, QualityHead
 from fusion.detection.network.initialize import init_weights
@@ -118,6 +119,8 @@ class DenseDetector(nn.Module):
         features = self.joined(jnp.concatenate([near, _double(wide, near)], axis=-1))
         at_cells = jax.vmap(lambda f, n, p, s: lift(self.config, f, n, p, s))
         camera = self.lifted(at_cells(features, inputs.plane, inputs.p2, inputs.image_size))
+        camera = teach_if_alive(camera, inputs.image)
+        lidar = teach_if_alive(lidar, inputs.bev)
         b = camera.shape[0]
         failed = jnp.full((b, 2), jnp.nan)
         if not self.config.gated:

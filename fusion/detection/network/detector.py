@@ -29,6 +29,7 @@ __all__ = [
     "crop_views",
     "fuse",
     "init_avod",
+    "teach_if_alive",
 ]
 
 SENSORS = ("camera", "lidar")
@@ -79,8 +80,8 @@ class Detector(nn.Module):
         self, image: Float[Array, "b h w 3"], bev: Float[Array, "b r c s"], train: bool
     ) -> Encoded:
         """Maps of both views and the fusion weights (0.5 each without a gate)."""
-        camera = _teach_if_alive(self.views[0](image, train), image)
-        lidar = _teach_if_alive(self.views[1](bev, train), bev)
+        camera = teach_if_alive(self.views[0](image, train), image)
+        lidar = teach_if_alive(self.views[1](bev, train), bev)
         maps = (nn.relu(self.reduce[0](camera)), nn.relu(self.reduce[1](lidar)))
         failed = jnp.full((image.shape[0], 2), jnp.nan)
         if not self.config.gated:
@@ -108,7 +109,7 @@ class Detector(nn.Module):
         return encoded
 
 
-def _teach_if_alive(features: Array, reading: Array) -> Array:
+def teach_if_alive(features: Array, reading: Array) -> Array:
     """Features that pass no gradient where the sensor's reading is one constant.
 
     A dead sensor teaches its view nothing, but normalization of maps without variance multiplies

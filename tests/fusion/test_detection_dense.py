@@ -19,7 +19,7 @@ from fusion.detection.learning.fitting import fit_detector, run_detector
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.training import DetectorTrainConfig
 from fusion.detection.network.build import count_main_parameters
-from fusion.detection.network.lift import grid_centres, lift
+from fusion.detection.network.lifting import grid_centres, lift
 from fusion.detection.presets import preset
 from fusion.targets import check_targets
 from tests.fusion.test_detection_network import a_frame

@@ -249,9 +249,8 @@ def test_a_corrupted_copy_takes_the_anchor_sizes_of_the_detector(root: Path) -> 
     path.write_text(path.read_text().replace(str(cache.sizes[0][0]), "4.5"))
     like = open_cache(root / "cache_tiny")
     assert like.sizes != cache.sizes and like.sizes[0][0] == 4.5
-    made = prepare_cache(
-        root, root / "corrupted", "tiny", splits=("val",), like=like, any_size=True
-    )
+    folder, only = root / "corrupted", ("val",)
+    made = prepare_cache(root, folder, "tiny", splits=only, like=like, any_size=True)
     assert made.sizes == like.sizes == open_cache(folder).sizes
     again = runs.build(choices.Train(root, size="tiny"), made).config.anchors
     assert again == runs.build(choices.Train(root, size="tiny"), like).config.anchors

@@ -20,7 +20,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fusion.detection.config import DetectorConfig
-from fusion.detection.network.lift import grid_centres
+from fusion.detection.network.lifting import grid_centres
 
 __all__ = ["GridTargets", "decode_cells", "grid_targets"]
 

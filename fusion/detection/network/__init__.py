@@ -30,7 +30,7 @@ from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
 from fusion.detection.network.heads import GridGate, MapGate, QualityHead, RpnHead, SecondHead
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.inputs import Inputs
-from fusion.detection.network.lift import grid_centres, lift
+from fusion.detection.network.lifting import grid_centres, lift
 from fusion.detection.network.proposals import (
     Detections,
     anchor_boxes,

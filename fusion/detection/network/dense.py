@@ -26,7 +26,7 @@ from fusion.detection.network.group_norm import group_norm_relu
 from fusion.detection.network.heads import GridGate, QualityHead
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.inputs import Inputs
-from fusion.detection.network.lift import lift
+from fusion.detection.network.lifting import lift
 from fusion.detection.sensors.quality import quality_statistics
 from fusion.targets import init_targets
 

@@ -103,6 +103,7 @@ RULES = (
     Rule("simulate_kitti.py --picture", "--size tiny"),
     Rule("simulate_kitti.py", "--frames 2 --val 2 --test 2 --size tiny"),
     Rule("study_geometry.py", "--frames 2 --any-size"),
+    Rule("study_anchors.py", "--data runs/kitti --size tiny --frames 2"),
     Rule(
         "draw_detections.py",
         "--data runs/kitti --min-cars 0 "
@@ -200,7 +201,7 @@ PLACEHOLDERS = {
 AREAS = {
     "detector": (
         "simulate_kitti", "train_detector", "evaluate_kitti", "study_detector", "study_geometry",
-        "study_views",
+        "study_views", "study_anchors",
         "draw_detections", "bench_detector", "bench_kitti_eval",
     ),
     "robots": (

@@ -19,7 +19,7 @@ from typing import Any
 
 from snn_fusion_failure.commands.detector_evaluation import evaluate
 from snn_fusion_failure.commands.detector_options import Eval, Robustness
-from snn_fusion_failure.commands.detector_runs import cache_folder, run_folder
+from snn_fusion_failure.commands.detector_runs import cache_folder, run_config, run_folder
 from snn_fusion_failure.runs import provenance, write_json
 
 METRIC = "3d_moderate_r40"
@@ -117,6 +117,7 @@ def robustness(config: Robustness) -> dict[str, Any]:
     print(f"{'clean':<28}{clean:8.2f}")
     for kind, by_level in cells.items():
         print(f"{kind:<28}" + "".join(f"{value:8.2f}" for value in by_level.values()))
-    found = {"model": config.model, "clean": clean} | summarize_cells(clean, cells, held)
+    model = run_config(run, plain).model
+    found = {"model": model, "clean": clean} | summarize_cells(clean, cells, held)
     write_json(out / "robustness.json", found | {"cells": cells, "provenance": provenance()})
     return found

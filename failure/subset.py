@@ -282,7 +282,12 @@ def _judge(
     else:
         error = float(p.std(ddof=1)) / math.sqrt(replicates)
         factor = float(student.ppf(0.975, replicates - 1))
-        lower, upper = log_normal_interval(mean, error, factor)
+        # A few replicates may look alike by luck; no ladder is better than independent samples.
+        rungs = float(runs.level.mean()) * (samples / n_chains - 1.0) / (replicates * samples)
+        ideal = mean * math.sqrt(rungs + 1.0 / float(runs.hits.sum()))
+        measured = log_normal_interval(mean, error, factor)
+        least = log_normal_interval(mean, ideal, 1.96)
+        lower, upper = min(measured[0], least[0]), max(measured[1], least[1])
         positive = p[p > 0]
         ratio = float(positive.max() / positive.min())
         if len(positive) < replicates or ratio > 100.0:

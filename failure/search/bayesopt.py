@@ -233,7 +233,8 @@ def _surrogate_ask(config: SearchConfig, state: SearchState) -> SearchState:
     x_host[:, :n] = state.u
     x, y, best = jnp.asarray(x_host), jnp.asarray(y_host), jnp.asarray(best_host)
     surrogate = state.surrogate
-    step = 1 if n <= 2 * config.n_init else config.refit_every
+    every = config.refit_every or max(2, n // 128)
+    step = 1 if n <= 2 * config.n_init else every
     posterior = state.posterior
     if surrogate is None or n - surrogate.n_fit >= step:
         surrogate = _fit(config, state, x, y)

@@ -73,7 +73,8 @@ class SearchConfig:
         retrain_every: evaluations between trainings of a learned space (0: once, on the initial
             ones); all of them count towards the budget.
         refit_every: evaluations between fits of the hyper-parameters once there are more than
-            `2 n_init`; in between points are appended to the factorisation.
+            `2 n_init`; in between points are appended to the factorisation. Without a number 2,
+            and from 384 points on one in 128 of them.
         gp: surrogate.
         acquisition: acquisition function and batch.
         turbo: trust region of `turbo`.
@@ -164,9 +165,7 @@ class SearchConfig:
                 f"acquisition.name={self.acquisition.name!r}: expected {method.acquisition!r} "
                 f"with method {self.method!r}; use method 'full' for other acquisitions"
             )
-        if self.refit_every is None:
-            self._set("refit_every", 2)
-        elif self.refit_every < 1:
+        if self.refit_every is not None and self.refit_every < 1:
             raise ValueError(f"refit_every={self.refit_every}: expected at least 1")
         if method.trust_region and self.turbo is None:
             self._set("turbo", TurboConfig())

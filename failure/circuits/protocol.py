@@ -12,6 +12,8 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from failure.status import Status
+
 __all__ = ["CHUNK", "Circuit", "Spec", "in_chunks"]
 
 CHUNK = 64
@@ -49,10 +51,14 @@ class Circuit:
     reference: Callable[..., tuple[np.ndarray, np.ndarray]] = field(repr=False)
     """The same samples by ngspice: `reference(x, **options) -> (specs, status)`."""
     box: float = 3.0
+    again: Callable[[Array], tuple[Array, Array]] | None = field(default=None, repr=False)
+    """A slower `run` for samples that the first could not solve; compiled when it is needed."""
     _jit: Any = field(init=False, repr=False)
+    _jit_again: Any = field(init=False, repr=False)
 
     def __post_init__(self) -> None:
         object.__setattr__(self, "_jit", jax.jit(self.run))
+        object.__setattr__(self, "_jit_again", jax.jit(self.again) if self.again else None)
 
     @property
     def n_dims(self) -> int:
@@ -105,8 +111,17 @@ class Circuit:
                 f"{self.name!r}"
             )
         with jax.enable_x64(True):
-            out: tuple[Array, Array] = self._jit(jnp.asarray(x, jnp.float64))
-            return out
+            specs, status = self._jit(jnp.asarray(x, jnp.float64))
+            if self.again is None or isinstance(status, jax.core.Tracer):
+                return specs, status
+            rows = np.flatnonzero(np.asarray(status) != Status.GOOD)
+            if rows.size == 0:
+                return specs, status
+            # A whole chunk, so that any number of them takes one program.
+            padded = np.resize(rows, -(-rows.size // CHUNK) * CHUNK)
+            new, new_status = self._jit_again(jnp.asarray(np.asarray(x)[padded], jnp.float64))
+            specs = specs.at[rows].set(new[: rows.size])
+            return specs, status.at[rows].set(new_status[: rows.size])
 
 
 def in_chunks(

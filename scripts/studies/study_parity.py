@@ -132,9 +132,12 @@ def ldo_grid(config: Config) -> dict[str, Any]:
         shipped = jax.jit(regulator.solve_ldo)
         finer = jax.jit(lambda u: regulator.solve_ldo(u, time=fine))
         for name, u in x.items():
-            a, b = (np.asarray(f(jnp.asarray(u))[0]).T[:, 1:2] for f in (shipped, finer))
+            (a, status), (b, _) = (map(np.asarray, f(jnp.asarray(u))) for f in (shipped, finer))
+            good = status == 0
+            a, b = a.T[good, 1:2], b.T[good, 1:2]
             result[name] = spread(a - b, b, ("undershoot",))["undershoot"]
             result[name]["beyond_2_mV"] = float(np.mean(np.abs(a - b) > 2e-3))
+            result[name]["not_resolved"] = int(np.sum(~good))
     return result
 
 

@@ -16,8 +16,11 @@ from failure.circuits.ldo.regulator import (
     lowest,
     solve_ldo,
     time_grid,
+    unresolved,
 )
+from failure.circuits.solver import ngspice
 from failure.circuits.solver.netlist import Mosfet
+from failure.status import Status
 
 N = 8
 
@@ -63,6 +66,35 @@ def test_result_is_float64_and_converged(solved) -> None:
 def test_recorded_numbers(samples, solved, golden: Path) -> None:
     held = json.loads((golden / "circuits_ldo.json").read_text())
     np.testing.assert_allclose(solved[0], held["specs"], rtol=1e-6)
+
+
+RINGING = np.random.default_rng(1).uniform(-3, 3, size=(60, 512))[:, 248]
+"""A sample of the box that rings faster than the steps: its undershoot would be 19 mV too large."""
+
+
+def test_a_ringing_that_the_steps_do_not_follow_is_not_converged(samples) -> None:
+    x = np.concatenate([RINGING[None], samples[1:]])
+    with jax.enable_x64(True):
+        _, status = circuits.get("ldo")._jit(jnp.asarray(x))
+    assert status.tolist() == [Status.NOT_CONVERGED] + [Status.GOOD] * (N - 1)
+
+
+def test_what_the_steps_leave_open_is_half_a_step_squared_of_the_bend() -> None:
+    t = np.array([0.0, 1.0, 3.0, 4.0])
+    with jax.enable_x64(True):
+        v = jnp.asarray(np.stack([(t - 1.5) ** 2, 0.0 * t], axis=1))
+        np.testing.assert_allclose(unresolved(t, v), [4.0 * 2.0 / 8.0, 0.0])
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(not ngspice.available(), reason="ngspice is not installed")
+def test_a_ringing_sample_is_simulated_again_with_finer_steps() -> None:
+    circuit = circuits.get("ldo")
+    x = np.stack([np.zeros(60), RINGING])
+    specs, status = map(np.asarray, circuit.simulate(x))
+    trusted, their_status = circuit.reference(x)
+    assert status.tolist() == their_status.tolist() == [0, 0]
+    assert np.abs(specs - trusted)[:, 1].max() < 2e-3
 
 
 def test_a_sample_alone_is_the_sample_in_a_batch(samples, solved) -> None:

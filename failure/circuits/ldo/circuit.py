@@ -7,15 +7,16 @@ from functools import lru_cache, partial
 from jaxtyping import Array, Float
 
 from failure.circuits.ldo.reference import ldo_reference
-from failure.circuits.ldo.regulator import NETLIST, QUANTITIES, SPECS, solve_ldo
+from failure.circuits.ldo.regulator import FINE, NETLIST, QUANTITIES, SPECS, TIME, solve_ldo
 from failure.circuits.protocol import Circuit, in_chunks
 from failure.circuits.solver.netlist import Mosfet
+from failure.circuits.solver.transient import Grid
 
 __all__ = ["make_ldo"]
 
 
-def _run(x: Float[Array, "n d"], *, model: str) -> tuple[Array, Array]:
-    return in_chunks(partial(solve_ldo, model=model), x)
+def _run(x: Float[Array, "n d"], *, model: str, time: Grid = TIME) -> tuple[Array, Array]:
+    return in_chunks(partial(solve_ldo, model=model, time=time), x)
 
 
 @lru_cache(maxsize=4)
@@ -39,5 +40,6 @@ def make_ldo(model: str = "ekv") -> Circuit:
         parameter_units=tuple(u for _ in mosfets for _, u, _ in QUANTITIES),
         specs=SPECS,
         run=partial(_run, model=model),
+        again=partial(_run, model=model, time=FINE),
         reference=partial(ldo_reference, model=model),
     )

@@ -135,6 +135,7 @@ class Name:
         node: definition of a function or a class; None for a module or a constant.
         kind: function, class, module or constant.
         text: first paragraph of its docstring.
+        inner: its name where it is defined.
     """
 
     package: str
@@ -143,6 +144,7 @@ class Name:
     node: Definition | None
     kind: str
     text: str
+    inner: str = ""
 
     @property
     def path(self) -> str:
@@ -173,10 +175,10 @@ def resolve(package: str, name: str) -> Name:
         if held is not None and wanted in held.definitions:
             node = held.definitions[wanted]
             kind = "class" if isinstance(node, ast.ClassDef) else "function"
-            return Name(package, name, module, node, kind, summary_of(node))
+            return Name(package, name, module, node, kind, summary_of(node), wanted)
         if held is not None and wanted in held.constants:
             text = one_line(held.constants[wanted])
-            return Name(package, name, module, None, "constant", text)
+            return Name(package, name, module, None, "constant", text, wanted)
         if held is None or wanted not in held.imported:
             raise ValueError(f"{package}.{name} is listed in `__all__`, but not in {module}")
         module, inner = held.imported[wanted]
@@ -236,9 +238,10 @@ def _package_pages(package: str) -> tuple[list[str], list[str]]:
         reference += ["", f"## {task}"]
         for name in group:
             shown = signature(name.node) if name.node else name.name
+            shown = shown.replace(f"{name.inner}(", f"{name.name}(", 1) if name.inner else shown
             link = f"[`{shown}`]({page_of(package)}#{name.path})"
             lines.append(f"| {link} | {_cell(name.text)} |")
-            target = name.home if name.kind == "module" else f"{name.home}.{name.name}"
+            target = name.home if name.kind == "module" else f"{name.home}.{name.inner}"
             reference += ["", f'<a id="{name.path}"></a>', "", f"::: {target}"]
     return lines, reference
 

@@ -148,6 +148,11 @@ RULES = (
         "--parts ldo_ngspice ldo_grid box --ldo-samples 8 --grid-samples 2 --box-samples 8",
         needs="ngspice",
     ),
+    Rule(
+        "study_sigma.py",
+        "--problems linear --specs --probabilities 1e-6 --methods lines --seeds 1 --dim 12 "
+        "--record runs/sigma.json",
+    ),
     Rule("study_rare_events.py", "--runs 1 --n-importance 50 --n-subset 100 --replicates 3"),
     Rule("bench_circuits.py", "--batch 2 --repeats 1 --ngspice-samples 2", needs="ngspice"),
     Rule("bench_revnet.py", "--dim 6 --samples 16 --depths 1 2"),
@@ -212,7 +217,7 @@ AREAS = {
     "fusion": ("train_argate", "study_argate", "bench_fusion", "bench_lattice", "reproduce"),
     "circuits": (
         "find_failures", "study_failures", "study_active", "study_circuits", "study_parity",
-        "study_rare_events", "bench_circuits", "bench_revnet", "bench_bo",
+        "study_rare_events", "study_sigma", "bench_circuits", "bench_revnet", "bench_bo",
     ),
 }  # fmt: skip
 """Scripts that need each other's files or share compiled programs; the rest is one area, too."""

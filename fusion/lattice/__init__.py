@@ -2,7 +2,8 @@
 
 Every kind of layer is a module of functions: `init(key, config)`, `apply(config, params, x)`,
 `project(config, params)` and `check(config, params)`. Nothing here depends on the rest of
-`fusion`. Pictures are in `fusion.lattice.plots`, which is imported on its own.
+`fusion`. The layers as flax modules are in `fusion.lattice.linen` and `fusion.lattice.nnx`,
+pictures in `fusion.lattice.plots`; these are imported on their own.
 """
 
 from fusion.lattice import (
@@ -22,6 +23,8 @@ from fusion.lattice.lattice_layer import vertices
 from fusion.lattice.linear import LinearConfig
 from fusion.lattice.optimizer import with_projection
 from fusion.lattice.pwl import PWLConfig, keypoints
+from fusion.lattice.quantiles import quantile_keypoints
+from fusion.lattice.tagged import check_tree, project_tree, tag
 
 __all__ = [
     "CategoricalConfig",
@@ -31,14 +34,20 @@ __all__ = [
     "LinearConfig",
     "PWLConfig",
     "categorical",
+    "check_tree",
     "deep_lattice",
     "ensemble",
     "keypoints",
     "lattice_layer",
     "linear",
+    "linen",
+    "nnx",
+    "project_tree",
     "pwl",
+    "quantile_keypoints",
     "random_features",
     "regularizers",
+    "tag",
     "vertices",
     "with_projection",
 ]

@@ -18,14 +18,12 @@ from fusion.lattice.checks import (
     require_static,
 )
 from fusion.lattice.projections import (
-    MARGIN,
     dykstra,
     order_closure,
-    order_depth,
     pair_projections,
     repair_order,
-    tilt,
 )
+from fusion.lattice.rounding import frame, onto, working
 
 __all__ = ["CategoricalConfig", "CategoricalParams", "apply", "check", "init", "project"]
 
@@ -130,47 +128,38 @@ def apply(
     return y
 
 
-def project(
-    config: CategoricalConfig, params: CategoricalParams, *, margin: float = MARGIN
-) -> CategoricalParams:
+def project(config: CategoricalConfig, params: CategoricalParams) -> CategoricalParams:
     """The nearest outputs that satisfy order and bounds, by Dykstra and an exact last step.
 
     Args:
         config: of the calibrator.
         params: of the calibrator.
-        margin: slack to leave, in float32 epsilons of the largest output; 0 for none.
 
     Returns:
-        CategoricalParams with `check(...) == 0`.
+        CategoricalParams with `check(...) == 0`, here and after an optimizer step that leads here.
+
+    Raises:
+        ValueError: the output range holds too few numbers of the type of the parameters.
     """
-    y = params.outputs
     closure = config.closure
-    depth = order_depth(closure)
-    slack = tilt(y, margin)
-    lift = slack * jnp.asarray(depth, y.dtype)
-    y = y - lift
     sets = pair_projections(closure)
+    if not sets and config.output_range == (None, None):
+        return params
+    y, missing = params.outputs, params.missing
+    together = y if missing is None else jnp.concatenate([y, missing[None]])
+    place = frame(together, config.output_range)
     if sets:
-        y = repair_order(dykstra(y, sets, config.n_iterations), closure)
-    y = _clip(config, y, slack, float(depth.max())) + lift
-    missing = params.missing
+        moved = dykstra(working(y) - place.centre, sets, config.n_iterations)
+        y = (repair_order(moved, closure) + place.centre).astype(working(y).dtype)
+    outputs = onto(place, y).astype(params.outputs.dtype)
     if missing is not None:
-        missing = _clip(config, missing, slack, 0.0)
-    return CategoricalParams(y, missing)
-
-
-def _clip(config: CategoricalConfig, y: Array, slack: Array, depth: float) -> Array:
-    low, high = config.output_range
-    if low is not None:
-        y = jnp.maximum(y, low + slack)
-    if high is not None:
-        y = jnp.minimum(y, high - slack * (depth + 1.0))
-    return y
+        missing = onto(place, missing).astype(missing.dtype)
+    return CategoricalParams(outputs, missing)
 
 
 def check(config: CategoricalConfig, params: CategoricalParams) -> Float[Array, ""]:
     """Largest violation of order and bounds; 0 where all hold."""
-    y = params.outputs
+    y = working(params.outputs)
     gap = jnp.where(config.closure, y[:, None] - y[None, :], 0.0)
     worst = jnp.maximum(jnp.max(gap), 0.0)
     low, high = config.output_range

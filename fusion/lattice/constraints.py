@@ -15,6 +15,7 @@ from jaxtyping import Array, Float
 
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.projections import dykstra, isotonic
+from fusion.lattice.rounding import frame, onto, working
 
 __all__ = ["interior", "project_vertices", "violation"]
 
@@ -103,23 +104,24 @@ def project_vertices(
     config: LatticeConfig,
     signs: np.ndarray | Array,
     v: Float[Array, "*sizes"],
-    slack: Float[Array, ""],
 ) -> Float[Array, "*sizes"]:
-    """Dykstra over the families of constraints, an exact repair, then the bounds.
+    """Dykstra over the families of constraints, an exact repair, the bounds, whole steps.
 
     Args:
         config: sizes and the other constraints.
         signs: monotonicity of each axis `[rank]`. A numpy array tells which axes are free while
             tracing, so that they cost nothing; a traced array decides at run time.
         v: vertices.
-        slack: slack to leave in each inequality.
 
     Returns:
-        Vertices without violation.
+        Vertices without violation, in the type of `v`.
+
+    Raises:
+        ValueError: the output range holds too few numbers of the type of `v`.
     """
     static = isinstance(signs, np.ndarray)
     axes: dict[int, Array | int] = {
-        axis: int(signs[axis]) if static else signs[axis].astype(v.dtype)
+        axis: int(signs[axis]) if static else signs[axis].astype(working(v).dtype)
         for axis in range(v.ndim)
         if not (static and signs[axis] == 0)
     }
@@ -133,10 +135,20 @@ def project_vertices(
             for j in range(min(2, config.sizes[conditional] - 1)):
                 sets.append(_trust(main, conditional, direction, (i, j)))
 
-    ramp = jnp.asarray(interior(config, signs), v.dtype)
-    low, high = config.output_range
-    floor = None if low is None else low + slack
-    ceiling = None if high is None else high - slack * (jnp.max(ramp) + 1.0)
+    if not sets and config.output_range == (None, None):
+        return v
+    kind, trust = v.dtype, bool(config.edgeworth_trust)
+    # Rounding four corners to steps bends a cell by two steps at most: trust keeps three.
+    ramp = interior(config, signs) if trust else np.zeros(config.sizes, np.float32)
+    least = 4.0 * (float(np.max(ramp)) + 2.0) if trust else 1.0
+    place = frame(v, config.output_range, least=least)
+    v = working(v) - place.centre
+    slack = place.step * (3.0 if trust else 0.0)
+    ramp = jnp.asarray(ramp, v.dtype)
+    floor = None if place.low is None else place.low - place.centre + slack
+    ceiling = (
+        None if place.high is None else place.high - place.centre - slack * (jnp.max(ramp) + 1.0)
+    )
 
     def clip(v: Array) -> Array:
         v = v if floor is None else jnp.maximum(v, floor)
@@ -144,7 +156,7 @@ def project_vertices(
 
     # The clipped projection onto order constraints is the projection onto order and bounds; with
     # trust it is not, and the bounds are one more set to iterate over.
-    if config.edgeworth_trust and (low is not None or high is not None):
+    if trust and (floor is not None or ceiling is not None):
         sets.append(clip)
     v = v - slack * ramp
     v = dykstra(v, sets, config.n_iterations)
@@ -154,9 +166,9 @@ def project_vertices(
         for axis, bend in centres.items():
             v = _repair_unimodal(v, axis, config.centre(axis), bend)
     v = clip(v)
-    if config.edgeworth_trust:
+    if trust:
         v = _repair_trust(config, v, ramp, floor, ceiling)
-    return v + slack * ramp
+    return onto(place, v + slack * ramp + place.centre).astype(kind)
 
 
 def _repair_monotone(v: Array, axis: int, sign: Array | int) -> Array:
@@ -205,6 +217,7 @@ def violation(
     config: LatticeConfig, signs: np.ndarray | Array, v: Float[Array, "*sizes"]
 ) -> Float[Array, ""]:
     """Largest violation of any inequality between vertices, or of the bounds; 0 for none."""
+    v = working(v)
     worst = _trust_violation(config, v)
     for axis in range(v.ndim):
         sign = jnp.asarray(signs[axis], v.dtype)

@@ -24,7 +24,6 @@ from fusion.lattice.checks import (
     require_static,
 )
 from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
-from fusion.lattice.projections import MARGIN
 
 __all__ = ["DeepLatticeConfig", "DeepLatticeParams", "apply", "check", "init", "project"]
 
@@ -240,25 +239,22 @@ def apply(
     return jnp.mean(outputs, axis=-1)
 
 
-def project(
-    config: DeepLatticeConfig, params: DeepLatticeParams, *, margin: float = MARGIN
-) -> DeepLatticeParams:
+def project(config: DeepLatticeConfig, params: DeepLatticeParams) -> DeepLatticeParams:
     """Each stage projected onto its own constraints, which together make the network monotone.
 
     Args:
         config: of the network.
         params: of the network. For K networks: `jax.vmap(project, (None, 0))`.
-        margin: slack to leave, in float32 epsilons of the largest parameter of each stage.
 
     Returns:
         DeepLatticeParams with `check(...) == 0`.
     """
     lattice = config.lattice
     return DeepLatticeParams(
-        pwl.project(config.inputs, params.inputs, margin=margin),
-        linear.project(config.embedding, params.embedding, margin=margin),
-        pwl.project(config.hidden, params.hidden, margin=margin),
-        jax.vmap(lambda p: lattice_layer.project(lattice, p, margin=margin))(params.lattices),
+        pwl.project(config.inputs, params.inputs),
+        linear.project(config.embedding, params.embedding),
+        pwl.project(config.hidden, params.hidden),
+        jax.vmap(lambda p: lattice_layer.project(lattice, p))(params.lattices),
     )
 
 

@@ -21,7 +21,6 @@ from fusion.lattice.checks import (
 )
 from fusion.lattice.constraints import project_vertices, violation
 from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
-from fusion.lattice.projections import MARGIN, tilt
 
 __all__ = ["EnsembleConfig", "apply", "check", "init", "project", "random_features"]
 
@@ -175,15 +174,12 @@ def apply(
     return jnp.mean(each(params, chosen), axis=-1)
 
 
-def project(
-    config: EnsembleConfig, params: LatticeParams, *, margin: float = MARGIN
-) -> LatticeParams:
+def project(config: EnsembleConfig, params: LatticeParams) -> LatticeParams:
     """Each lattice projected onto its constraints, all of them in one vmapped program.
 
     Args:
         config: of the ensemble.
         params: of the ensemble.
-        margin: slack to leave, in float32 epsilons of each lattice's largest vertex.
 
     Returns:
         LatticeParams with `check(...) == 0`.
@@ -192,9 +188,9 @@ def project(
     signs = config.signs
     if np.all(signs == signs[0]):
         row = signs[0]
-        each = jax.vmap(lambda v: project_vertices(lattice, row, v, tilt(v, margin)))
+        each = jax.vmap(lambda v: project_vertices(lattice, row, v))
         return LatticeParams(each(params.vertices))
-    mixed = jax.vmap(lambda v, row: project_vertices(lattice, row, v, tilt(v, margin)))
+    mixed = jax.vmap(lambda v, row: project_vertices(lattice, row, v))
     return LatticeParams(mixed(params.vertices, jnp.asarray(signs)))
 
 

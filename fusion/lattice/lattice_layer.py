@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 import math
 
 import jax
@@ -12,7 +13,7 @@ from jaxtyping import Array, Float, Key
 from fusion.lattice.checks import require_key, require_width
 from fusion.lattice.constraints import project_vertices, violation
 from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
-from fusion.lattice.projections import MARGIN, tilt
+from fusion.lattice.rounding import frame, onto
 
 __all__ = ["apply", "check", "init", "project", "vertices"]
 
@@ -36,22 +37,37 @@ def init(key: Key[Array, ""], config: LatticeConfig) -> LatticeParams:
         low = 0.0 if high is None else high - 1.0
     if high is None:
         high = low + 1.0
+    # On the host, but for the coins: a thousand vertices are not worth a compiled program for each
+    # operation. Only trust needs a projection: every order holds in a plane.
     index = np.indices(config.sizes)
-    coin = jax.random.rademacher(key, (config.rank,), dtype=jnp.float32)
-    plane = jnp.zeros(config.sizes)
+    fixed = np.zeros(config.sizes)
+    free = []
     for axis, size in enumerate(config.sizes):
-        fraction = jnp.asarray(index[axis] / (size - 1) - 0.5, jnp.float32)
+        fraction = index[axis] / (size - 1) - 0.5
         unimodal = config.unimodality[axis] if config.unimodality else 0
         if unimodal:
             centre = config.centre(axis)
-            distance = np.abs(index[axis] - centre) / max(centre, size - 1 - centre) - 0.5
-            plane = plane + jnp.asarray(unimodal * distance, jnp.float32)
+            fixed += unimodal * (
+                np.abs(index[axis] - centre) / max(centre, size - 1 - centre) - 0.5
+            )
         elif config.signs[axis]:
-            plane = plane + float(config.signs[axis]) * fraction
+            fixed += config.signs[axis] * fraction
         else:
-            plane = plane + coin[axis] * fraction
-    plane = low + (high - low) * (plane / config.rank + 0.5)
-    return project(config, LatticeParams(plane))
+            free.append((axis, fraction))
+    scale = (high - low) / config.rank
+    plane = jnp.asarray(low + 0.5 * (high - low) + scale * fixed, jnp.float32)
+    if free:
+        axes, fractions = (np.stack(part) for part in zip(*free, strict=True))
+        coin = jax.random.rademacher(key, (config.rank,), dtype=jnp.float32)[axes]
+        plane = plane + jnp.tensordot(coin, jnp.asarray(scale * fractions, jnp.float32), 1)
+    if config.edgeworth_trust:
+        return project(config, LatticeParams(plane))
+    return LatticeParams(_settle(plane, config.output_range))
+
+
+@functools.partial(jax.jit, static_argnums=1)
+def _settle(plane: Array, output_range: tuple[float | None, float | None]) -> Array:
+    return onto(frame(plane, output_range), plane)
 
 
 def apply(
@@ -133,9 +149,7 @@ def _simplex(config: LatticeConfig, v: Array, x: Array) -> Array:
     return values[..., 0] + jnp.sum(ordered * jnp.diff(values, axis=-1), axis=-1)
 
 
-def project(
-    config: LatticeConfig, params: LatticeParams, *, margin: float = MARGIN
-) -> LatticeParams:
+def project(config: LatticeConfig, params: LatticeParams) -> LatticeParams:
     """The nearest lattice that satisfies the constraints, by Dykstra and an exact last step.
 
     One family of constraints is projected in closed form. Several take `config.n_iterations`
@@ -145,13 +159,14 @@ def project(
     Args:
         config: of the lattice.
         params: of the lattice.
-        margin: slack to leave, in float32 epsilons of the largest vertex; 0 for none.
 
     Returns:
-        LatticeParams with `check(...) == 0`.
+        LatticeParams with `check(...) == 0`, here and after an optimizer step that leads here.
+
+    Raises:
+        ValueError: the output range holds too few numbers of the type of the parameters.
     """
-    v = params.vertices
-    return LatticeParams(project_vertices(config, config.signs, v, tilt(v, margin)))
+    return LatticeParams(project_vertices(config, config.signs, params.vertices))
 
 
 def check(config: LatticeConfig, params: LatticeParams) -> Float[Array, ""]:

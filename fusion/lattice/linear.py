@@ -19,14 +19,13 @@ from fusion.lattice.checks import (
     require_width,
 )
 from fusion.lattice.projections import (
-    MARGIN,
     dykstra,
     order_closure,
     order_depth,
     pair_projections,
     repair_order,
-    tilt,
 )
+from fusion.lattice.rounding import working
 
 __all__ = ["LinearConfig", "LinearParams", "apply", "check", "init", "project"]
 
@@ -226,7 +225,7 @@ def _dominance(config: LinearConfig) -> tuple[np.ndarray, np.ndarray] | None:
     return width, order_closure(pairs, config.n_inputs)
 
 
-def project(config: LinearConfig, params: LinearParams, *, margin: float = MARGIN) -> LinearParams:
+def project(config: LinearConfig, params: LinearParams) -> LinearParams:
     r"""The nearest weights that satisfy the constraints.
 
     Signs are clipped; dominance pairs are half-spaces, solved together with the signs by
@@ -237,13 +236,12 @@ def project(config: LinearConfig, params: LinearParams, *, margin: float = MARGI
     Args:
         config: of the layer.
         params: of the layer.
-        margin: slack that dominance keeps, in float32 epsilons of the largest weight.
 
     Returns:
         LinearParams with `check(...) == 0`.
     """
     signs, links = config.signs, config.links
-    w = params.weights
+    kind, w = params.weights.dtype, working(params.weights)
     sign = jnp.asarray(np.where(signs < 0, -1, 1), w.dtype)
     # In mirrored weights every constraint reads ">= 0" or "strong >= weak".
     v = jnp.where(links, w * sign, 0.0)
@@ -268,14 +266,20 @@ def project(config: LinearConfig, params: LinearParams, *, margin: float = MARGI
         depth = jnp.asarray(order_depth(closure)[None, :], v.dtype)
         paired = np.logical_or(strict.any(0), strict.any(1))
         tied = jnp.asarray(paired[None, :] & links & (signs != 0))
-        fixed = (fixed + tilt(v * scale, margin) * depth) / scale
+        fixed = (fixed + _slack(kind, v * scale) * depth) / scale
         v = jnp.where(tied, fixed, v)
     if config.normalized:
         total = jnp.sum(jnp.abs(v), axis=-1, keepdims=True)
         # All weights at zero have no direction: start again from equal ones.
         equal = jnp.asarray(links / links.sum(1, keepdims=True), v.dtype)
         v = jnp.where(total > 1e-12, v / jnp.maximum(total, 1e-12), equal)
-    return LinearParams(v * sign, params.bias)
+    return LinearParams((v * sign).astype(kind), params.bias)
+
+
+def _slack(kind: np.dtype, values: Array) -> Array:
+    """What dominance keeps above the rounding of weights, and of their products with widths."""
+    units = 16.0 if kind in (jnp.float32, jnp.float64) else 4.0
+    return units * float(jnp.finfo(kind).eps) * jnp.max(jnp.abs(values))
 
 
 def _simplex(v: Array, links: np.ndarray) -> Array:
@@ -295,7 +299,7 @@ def check(config: LinearConfig, params: LinearParams) -> Float[Array, ""]:
 
     The norm counts as 1 within rounding: a few epsilons for each weight.
     """
-    w = params.weights
+    kind, w = params.weights.dtype, working(params.weights)
     signs, links = config.signs, config.links
     v = w * jnp.asarray(np.where(signs < 0, -1, 1), w.dtype)
     worst = jnp.max(jnp.where(links, jnp.where(signs == 0, 0.0, -v), jnp.abs(v)))
@@ -308,6 +312,6 @@ def check(config: LinearConfig, params: LinearParams) -> Float[Array, ""]:
         worst = jnp.maximum(worst, jnp.max(u[:, low] - u[:, high]))
     if config.normalized:
         off = jnp.abs(jnp.sum(jnp.abs(v), axis=-1) - 1.0)
-        allowed = _NORM_TOLERANCE * config.n_inputs * float(jnp.finfo(w.dtype).eps)
+        allowed = _NORM_TOLERANCE * config.n_inputs * float(jnp.finfo(kind).eps)
         worst = jnp.maximum(worst, jnp.max(jnp.where(off > allowed, off, 0.0)))
     return worst

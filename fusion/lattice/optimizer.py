@@ -10,12 +10,13 @@ import jax.numpy as jnp
 import optax
 
 from fusion.lattice.checks import refusal
+from fusion.lattice.tagged import project_tree
 
 __all__ = ["with_projection"]
 
 
 def with_projection(
-    optimizer: optax.GradientTransformation, project: Callable[[Any], Any]
+    optimizer: optax.GradientTransformation, project: Callable[[Any], Any] = project_tree
 ) -> optax.GradientTransformationExtraArgs:
     r"""An optimizer whose step ends on the constraints.
 
@@ -26,14 +27,15 @@ def with_projection(
     `optax.apply_updates`.
 
     It composes with `optax.chain`, as its last member: what scales the update afterwards would
-    leave the constraints. The moments of the inner optimizer see the gradient only, not the
-    projection. The projections of this package keep a slack above the rounding of
-    :math:`\theta + u'`, so that the violation after `optax.apply_updates` is exactly zero
-    (unless the largest parameter shrinks more than tenfold in one step).
+    leave the constraints. Inside `optax.masked`, `optax.partition` and `optax.MultiSteps` it
+    projects the layers that it sees. The moments of the inner optimizer see the gradient only, not
+    the projection. Projections end on steps that survive the rounding of :math:`\theta + u'`
+    (`fusion.lattice.rounding`), so that the violation after `optax.apply_updates` is exactly zero.
 
     Args:
         optimizer: any optax transformation that yields updates to add.
-        project: from parameters to feasible parameters of the same structure, for example
+        project: from parameters to feasible parameters of the same structure. Without it every
+            tagged layer of the tree is projected; for plain parameters for example
             `lambda p: deep_lattice.project(config, p)`, vmapped where parameters are.
 
     Returns:
@@ -66,6 +68,15 @@ def with_projection(
             )
         updates, state = inner.update(updates, state, params, **extra)
         moved = project(optax.apply_updates(params, updates))
-        return jax.tree.map(jnp.subtract, moved, params), state
+        return jax.tree.map(_difference, moved, params, updates, is_leaf=_is_masked), state
 
     return optax.GradientTransformationExtraArgs(inner.init, update)
+
+
+def _is_masked(node: Any) -> bool:
+    return isinstance(node, optax.MaskedNode)
+
+
+def _difference(moved: Any, before: Any, update: Any) -> Any:
+    """The update, in its own type; nothing where optax has masked the parameter out."""
+    return before if _is_masked(before) else jnp.subtract(moved, before).astype(update.dtype)

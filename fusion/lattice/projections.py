@@ -17,28 +17,16 @@ from jaxtyping import Array, Float
 from fusion.lattice.checks import refusal
 
 __all__ = [
-    "MARGIN",
     "dykstra",
     "isotonic",
     "order_closure",
     "order_depth",
     "pair_projections",
     "repair_order",
-    "tilt",
 ]
-
-# `project` leaves this slack, in units of float32 epsilon times the largest parameter. An optax
-# update is a difference, and `params + (projected - params)` is off by about one unit: the slack
-# (about 2e-6) is what keeps the violation at exactly zero after `optax.apply_updates`.
-MARGIN = 16.0
 
 # Longest axis for which `isotonic` is written out; chosen by timing 5 to 20 on one CPU thread.
 _UNROLLED = 16
-
-
-def tilt(values: Float[Array, "*shape"], margin: float) -> Float[Array, ""]:
-    """Slack in absolute terms: `margin` times epsilon times the largest magnitude in `values`."""
-    return margin * jnp.finfo(values.dtype).eps * jnp.max(jnp.abs(values))
 
 
 def isotonic(values: Float[Array, "*shape"], axis: int = -1) -> Float[Array, "*shape"]:

@@ -20,9 +20,19 @@ from fusion.lattice.checks import (
     require_static,
     require_width,
 )
-from fusion.lattice.projections import MARGIN, isotonic, tilt
+from fusion.lattice.curvature import bent, curvature, project_bent
+from fusion.lattice.projections import isotonic
+from fusion.lattice.rounding import frame, onto, working
 
-__all__ = ["PWLConfig", "PWLParams", "apply", "check", "init", "keypoints", "project"]
+__all__ = [
+    "PWLConfig",
+    "PWLParams",
+    "apply",
+    "check",
+    "init",
+    "keypoints",
+    "project",
+]
 
 
 class PWLParams(NamedTuple):
@@ -51,9 +61,21 @@ class PWLConfig:
         monotonicity: -1 (non-increasing), 0 (free) or +1 (non-decreasing), for all inputs or one
             for each.
         output_range: `(low, high)`, either of which may be `None` (no bound).
-        keypoints: positions for each input, in place of the even spacing, e.g. quantiles.
+        convexity: -1 (concave), 0 (free) or +1 (convex), for all inputs or one for each; beside
+            any monotonicity.
+        keypoints: positions for each input, in place of the even spacing, e.g. from
+            `quantile_keypoints`.
         learned_keypoints: learn where the inner keypoints are; the outer two stay.
         missing_value: inputs equal to this (`nan` is allowed) get a learned output of their own.
+        n_iterations: passes of Dykstra's algorithm, where calibrators are convex or concave.
+
+    Raises:
+        ValueError: sizes, ranges or directions mean nothing.
+        TypeError: a field is of a wrong type, such as a list for a tuple.
+
+    Example:
+        >>> PWLConfig(2, 3, input_range=(0.0, 4.0), monotonicity=(1, 0)).start.tolist()
+        [[0.0, 2.0, 4.0], [0.0, 2.0, 4.0]]
     """
 
     n_inputs: int
@@ -64,17 +86,23 @@ class PWLConfig:
     keypoints: tuple[tuple[float, ...], ...] | None = None
     learned_keypoints: bool = False
     missing_value: float | None = None
+    convexity: int | tuple[int, ...] = 0
+    n_iterations: int = 20
 
     def __post_init__(self) -> None:
         """Refuse sizes, ranges and directions that mean nothing."""
         require_static(self)
         require_count("n_inputs", self.n_inputs)
         require_count("n_keypoints", self.n_keypoints, 2)
-        given = self.monotonicity
-        require_signs(
-            "monotonicity", given if isinstance(given, tuple) else (given,) * self.n_inputs,
-            self.n_inputs,
-        )  # fmt: skip
+        require_count("n_iterations", self.n_iterations)
+        for name in ("monotonicity", "convexity"):
+            given = getattr(self, name)
+            row = given if isinstance(given, tuple) else (given,) * self.n_inputs
+            require_signs(name, row, self.n_inputs)
+        if self.learned_keypoints and np.any(self.bends):
+            raise refusal(
+                "learned_keypoints", True, "False beside convexity", "give keypoints from the data"
+            )
         require_range("output_range", self.output_range)
         shape = (self.n_inputs, self.n_keypoints)
         if self.keypoints is not None:
@@ -103,6 +131,11 @@ class PWLConfig:
     def signs(self) -> np.ndarray:
         """`[n_inputs]` of -1, 0, 1."""
         return np.broadcast_to(np.asarray(self.monotonicity, np.int64), (self.n_inputs,))
+
+    @property
+    def bends(self) -> np.ndarray:
+        """`[n_inputs]` of -1 (concave), 0, 1 (convex)."""
+        return np.broadcast_to(np.asarray(self.convexity, np.int64), (self.n_inputs,))
 
     @property
     def start(self) -> np.ndarray:
@@ -143,7 +176,8 @@ def init(key: Key[Array, ""], config: PWLConfig) -> PWLParams:
         spacing = jnp.asarray(np.log(np.diff(start) / width), jnp.float32)
     if config.missing_value is not None:
         missing = jnp.asarray(outputs.mean(axis=-1), jnp.float32)
-    return project(config, PWLParams(jnp.asarray(outputs, jnp.float32), spacing, missing))
+    params = PWLParams(jnp.asarray(outputs, jnp.float32), spacing, missing)
+    return params if _free(config) else project(config, params)
 
 
 def keypoints(
@@ -218,63 +252,75 @@ def _absent(config: PWLConfig, x: Array) -> Array:
     return jnp.isnan(x) if math.isnan(value) else x == value
 
 
-def project(config: PWLConfig, params: PWLParams, *, margin: float = MARGIN) -> PWLParams:
-    r"""The nearest calibrators that satisfy monotonicity and bounds (Euclidean, exact).
+def project(config: PWLConfig, params: PWLParams) -> PWLParams:
+    r"""The nearest calibrators that satisfy monotonicity, convexity and bounds.
 
-    Isotonic regression, then clipping: the projection onto monotone sequences within constant
-    bounds is the clipped projection onto monotone sequences.
+    Without convexity this is exact: isotonic regression, then clipping, since the projection onto
+    monotone sequences within constant bounds is the clipped projection onto monotone sequences.
+    With it, Dykstra's algorithm tends to the nearest calibrators, and a last step makes them
+    feasible.
 
     Args:
         config: of the layer.
         params: of the layer.
-        margin: slack to leave, in float32 epsilons of the largest output; 0 for none.
 
     Returns:
-        PWLParams with `check(...) == 0`.
+        PWLParams with `check(...) == 0`, here and after an optimizer step that leads here.
+
+    Raises:
+        ValueError: the output range holds too few numbers of the type of the parameters.
     """
-    y = params.outputs
-    signs = config.signs[:, None]
-    slack = tilt(y, margin)
-    last = config.n_keypoints - 1
-    rank = np.where(signs >= 0, np.arange(last + 1), last - np.arange(last + 1)) * np.abs(signs)
-    lift = slack * jnp.asarray(rank, y.dtype)
-    y = y - lift
-    if np.any(signs):
-        # Only the rows from the first monotone input to the last: put them side by side.
-        monotone = np.flatnonzero(config.signs)
-        rows = slice(int(monotone[0]), int(monotone[-1]) + 1)
-        part, bound = y[rows], signs[rows]
-        direction = jnp.asarray(np.where(bound < 0, -1, 1), y.dtype)
-        ordered = isotonic(part * direction) * direction
-        if not bound.all():
-            ordered = jnp.where(np.broadcast_to(bound != 0, part.shape), ordered, part)
-        y = jnp.concatenate([y[: rows.start], ordered, y[rows.stop :]])
-    y = _clip(config, y, slack, jnp.asarray(last * np.abs(signs), y.dtype)) + lift
-    missing = params.missing
+    if _free(config):
+        return params
+    y, missing = params.outputs, params.missing
+    bends, signs = config.bends, config.signs
+    row = y if missing is None else jnp.concatenate([y, missing[:, None]], axis=-1)
+    ramp, least = bent(config.start, signs, bends)
+    place = frame(row, config.output_range, axis=-1, least=least)
+    if np.any(bends):
+        outputs = project_bent(
+            y, place, config.start, signs, bends, ramp, n_iterations=config.n_iterations
+        )
+    else:
+        outputs = _isotonic_rows(working(y) - place.centre, signs) + place.centre
+    outputs = onto(place, outputs).astype(y.dtype)
     if missing is not None:
-        missing = _clip(config, missing, slack, None)
-    return PWLParams(y, params.spacing, missing)
+        missing = onto(place, working(missing)[:, None])[:, 0].astype(missing.dtype)
+    return PWLParams(outputs, params.spacing, missing)
 
 
-def _clip(config: PWLConfig, y: Array, slack: Array, ranks: Array | None) -> Array:
-    low, high = config.output_range
-    if low is not None:
-        y = jnp.maximum(y, low + slack)
-    if high is not None:
-        ceiling = high - slack if ranks is None else high - slack * (ranks + 1.0)
-        y = jnp.minimum(y, ceiling)
-    return y
+def _free(config: PWLConfig) -> bool:
+    nothing = config.output_range == (None, None)
+    return nothing and not np.any(config.signs) and not np.any(config.bends)
+
+
+def _isotonic_rows(y: Array, signs: np.ndarray) -> Array:
+    """Isotonic regression of the rows that have a sign, antitonic for -1."""
+    if not np.any(signs):
+        return y
+    # Only the rows from the first monotone input to the last: put them side by side.
+    monotone = np.flatnonzero(signs)
+    rows = slice(int(monotone[0]), int(monotone[-1]) + 1)
+    part, bound = y[rows], signs[rows, None]
+    direction = jnp.asarray(np.where(bound < 0, -1, 1), y.dtype)
+    ordered = isotonic(part * direction) * direction
+    if not bound.all():
+        ordered = jnp.where(np.broadcast_to(bound != 0, part.shape), ordered, part)
+    return jnp.concatenate([y[: rows.start], ordered, y[rows.stop :]])
 
 
 def check(config: PWLConfig, params: PWLParams) -> Float[Array, ""]:
-    """Largest violation of monotonicity and bounds; 0 where all constraints hold."""
-    y = params.outputs
+    """Largest violation of monotonicity, convexity and bounds; 0 where all constraints hold."""
+    y = working(params.outputs)
     signs = jnp.asarray(config.signs[:, None], y.dtype)
     worst = jnp.maximum(0.0, jnp.max(-signs * jnp.diff(y, axis=-1)))
+    if np.any(config.bends) and config.n_keypoints > 2:
+        bends = jnp.asarray(config.bends[:, None], y.dtype)
+        worst = jnp.maximum(worst, jnp.max(-bends * curvature(y, config.start)))
     low, high = config.output_range
     for values in (y, params.missing):
         if values is not None and low is not None:
-            worst = jnp.maximum(worst, low - jnp.min(values))
+            worst = jnp.maximum(worst, low - jnp.min(working(values)))
         if values is not None and high is not None:
-            worst = jnp.maximum(worst, jnp.max(values) - high)
+            worst = jnp.maximum(worst, jnp.max(working(values)) - high)
     return worst

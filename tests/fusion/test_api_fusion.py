@@ -24,6 +24,7 @@ from fusion.lattice import (
     projections,
     pwl,
     regularizers,
+    rounding,
 )
 from tests._api import Case, check
 
@@ -268,11 +269,11 @@ CASES = [
     ),
     Case("lattice.projections.isotonic", lambda v: projections.isotonic(v) ** 2, normal((2, 5))),
     Case(
-        "lattice.projections.tilt",
-        lambda v: projections.tilt(v, 8.0),
-        lambda rng: f32(100.0 * rng.normal(size=4)),
+        "lattice.rounding.onto",
+        lambda v: rounding.onto(rounding.frame(v, (0.0, 1.0)), v),
+        normal((4,)),
         (),
-        "a rounding slack",
+        "rounds to steps",
     ),
     Case(
         "lattice.projections.dykstra",

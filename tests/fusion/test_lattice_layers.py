@@ -43,6 +43,8 @@ from fusion.targets import TargetConfig
 MODULES = (
     "checks",
     "lattice_config",
+    "quantiles",
+    "rounding",
     "projections",
     "pwl",
     "categorical",

@@ -1,0 +1,135 @@
+"""Layers as `flax.linen` modules, whose parameters carry their configuration.
+
+Each module takes the `Config` of its layer. `project_tree(variables["params"])` and
+`with_projection(optimizer)` find the layers wherever they are in a model, also under `nn.vmap`,
+`nn.scan`, `nn.remat` and inside masked or partitioned optimizers.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import flax.linen as nn
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Float, Int
+
+from fusion.lattice import categorical, deep_lattice, ensemble, pwl
+from fusion.lattice import linear as linear_layer
+from fusion.lattice.lattice_config import LatticeConfig
+from fusion.lattice.tagged import Tagged, layer_of, tag
+
+__all__ = [
+    "CategoricalCalibration",
+    "DeepLattice",
+    "Ensemble",
+    "Lattice",
+    "Linear",
+    "PWLCalibration",
+    "first_params",
+]
+
+
+def first_params(key: Array, config: Any, dtype: Any = jnp.float32) -> Tagged:
+    """Tagged parameters of a layer in a given type, feasible in it.
+
+    Args:
+        key: typed key, or the legacy key that many flax programs pass.
+        config: of the layer.
+        dtype: of the parameters.
+
+    Returns:
+        Tagged parameters of `layer_of(config).init`.
+    """
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jax.random.wrap_key_data(key)
+    layer = layer_of(config)
+    params = layer.init(key, config)
+    if jnp.dtype(dtype) != jnp.float32:
+        params = layer.project(config, jax.tree.map(lambda a: a.astype(dtype), params))
+    return tag(config, params)
+
+
+class _Layer(nn.Module):
+    """What all layers share: a tagged parameter `layer`, and `apply` of its functions."""
+
+    def _apply(self, config: Any, x: Array, dtype: Any) -> Array:
+        params = self.param("layer", first_params, config, dtype)
+        return layer_of(config).apply(config, params, x)
+
+
+class PWLCalibration(_Layer):
+    """Piecewise-linear calibrators `[..., n_inputs] -> [..., n_inputs]`.
+
+    Attributes:
+        config: of the layer.
+        param_dtype: type of the parameters.
+    """
+
+    config: pwl.PWLConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch n_inputs"]:
+        """Each input through its own calibrator."""
+        return self._apply(self.config, x, self.param_dtype)
+
+
+class CategoricalCalibration(_Layer):
+    """Calibrator of one categorical input, `[...] -> [...]`; attributes as in `PWLCalibration`."""
+
+    config: categorical.CategoricalConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Int[Array, "*batch"]) -> Float[Array, "*batch"]:
+        """The output of each category."""
+        return self._apply(self.config, x, self.param_dtype)
+
+
+class Linear(_Layer):
+    """Constrained linear layer `[..., n_inputs] -> [..., n_outputs]`."""
+
+    config: linear_layer.LinearConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch n_outputs"]:
+        """Weighted sums of the inputs."""
+        return self._apply(self.config, x, self.param_dtype)
+
+
+class Lattice(_Layer):
+    """One lattice `[..., rank] -> [...]`."""
+
+    config: LatticeConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch rank"]) -> Float[Array, "*batch"]:
+        """The interpolated output."""
+        return self._apply(self.config, x, self.param_dtype)
+
+
+class Ensemble(_Layer):
+    """Mean of lattices over subsets of the inputs, `[..., n_inputs] -> [...]`."""
+
+    config: ensemble.EnsembleConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch"]:
+        """The mean of the lattices' outputs."""
+        return self._apply(self.config, x, self.param_dtype)
+
+
+class DeepLattice(_Layer):
+    """Calibrators, linear embedding, calibrators, lattices, `[..., n_inputs] -> [...]`."""
+
+    config: deep_lattice.DeepLatticeConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch"]:
+        """The network's output."""
+        return self._apply(self.config, x, self.param_dtype)

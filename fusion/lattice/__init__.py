@@ -18,6 +18,7 @@ from fusion.lattice import (
 from fusion.lattice.categorical import CategoricalConfig
 from fusion.lattice.deep_lattice import DeepLatticeConfig
 from fusion.lattice.ensemble import EnsembleConfig, random_features
+from fusion.lattice.estimators import LatticeClassifier, LatticeRegressor
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.lattice_layer import vertices
 from fusion.lattice.linear import LinearConfig
@@ -30,7 +31,9 @@ __all__ = [
     "CategoricalConfig",
     "DeepLatticeConfig",
     "EnsembleConfig",
+    "LatticeClassifier",
     "LatticeConfig",
+    "LatticeRegressor",
     "LinearConfig",
     "PWLConfig",
     "categorical",
@@ -42,6 +45,7 @@ __all__ = [
     "linear",
     "linen",
     "nnx",
+    "premade",
     "project_tree",
     "pwl",
     "quantile_keypoints",

@@ -114,21 +114,32 @@ def apply(
 
 
 def _hypercube(config: LatticeConfig, v: Array, x: Array) -> Array:
-    """Contract one axis after another, the largest product first as one matrix product."""
-    batch = x.shape[:-1]
-    lead = (1,) * len(batch)
-    rest = math.prod(config.sizes)
-    out = v
-    for axis, size in enumerate(config.sizes):
-        rest //= size
+    """Corner weights of two halves of the axes, with the table as a matrix between them.
+
+    The table of all corner weights of a batch would be as large as batch times lattice; the two
+    halves are its square root.
+    """
+    sizes = config.sizes
+    products = [math.prod(sizes[:axis]) for axis in range(1, config.rank + 1)]
+    split = 1 + int(np.argmin([max(p, products[-1] // p) for p in products]))
+    left = _corner_weights(config, x, range(split))
+    right = _corner_weights(config, x, range(split, config.rank))
+    table = v.reshape(left.shape[-1], right.shape[-1])
+    return jnp.sum((left @ table) * right, axis=-1)
+
+
+def _corner_weights(config: LatticeConfig, x: Array, axes: range) -> Array:
+    """Product over some axes of the weight of each of their vertices, flattened."""
+    batch, lead = x.shape[:-1], (1,) * (x.ndim - 1)
+    out: Array | None = None
+    for axis in axes:
+        size = config.sizes[axis]
         at = jnp.clip(x[..., axis], 0.0, size - 1.0)[..., None]
         places = jnp.arange(size, dtype=x.dtype).reshape(*lead, size)
         weights = jnp.maximum(1.0 - jnp.abs(at - places), 0.0)
-        if axis == 0:
-            out = weights @ out.reshape(size, rest)
-        else:
-            out = jnp.sum(weights[..., None] * out.reshape(*batch, size, rest), axis=-2)
-    return out.reshape(batch)
+        pairs = weights if out is None else out[..., :, None] * weights[..., None, :]
+        out = pairs.reshape(*batch, -1)
+    return jnp.ones((*batch, 1), x.dtype) if out is None else out
 
 
 def _simplex(config: LatticeConfig, v: Array, x: Array) -> Array:

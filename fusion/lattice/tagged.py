@@ -18,7 +18,7 @@ from flax import struct
 from flax.core import meta
 from jaxtyping import Array, Float
 
-from fusion.lattice import categorical, deep_lattice, ensemble, lattice_layer, linear, pwl
+from fusion.lattice import categorical, deep_lattice, ensemble, lattice_layer, linear, premade, pwl
 from fusion.lattice.checks import refusal
 from fusion.lattice.lattice_config import LatticeConfig
 
@@ -31,6 +31,7 @@ LAYERS: dict[type, ModuleType] = {
     LatticeConfig: lattice_layer,
     ensemble.EnsembleConfig: ensemble,
     deep_lattice.DeepLatticeConfig: deep_lattice,
+    premade.CalibratedConfig: premade,
 }
 """Configuration -> the module of functions that understands it."""
 

@@ -1,36 +1,59 @@
-"""Cost of the constraints: a training step with projection against the same step without.
+"""Speed of lattices: what constraints cost, and forward and backward against pytorch-lattice.
 
     python scripts/benchmarks/bench_lattice.py
+    python scripts/benchmarks/bench_lattice.py --parts peer --record
 
-About one minute on one CPU thread. Prints one line for each model with the CPU time of a step and
-the ratio (median over repeats that alternate between the two), then `result:` with the ratios.
-A ratio of 1.15 means that constraints cost 15 % of an unconstrained step. Pin it to a core for a
-steady figure: `taskset -c 0 python scripts/benchmarks/bench_lattice.py`.
+Two parts, all times CPU times of one thread, medians over repeats that alternate between the two
+sides. `constraints`: a training step with projection over the same step without; 1.15 means that
+constraints cost 15 % of a step. `peer`: forward and backward (slopes of table and inputs) of a
+lattice of 2^6 to 2^12 vertices on a batch of 1,024, over the time of pytorch-lattice on the same
+numbers; it computes in float64, so ours is timed in float32 and in float64. This part needs
+`pip install torch==2.13.0 pandas` and `pip install --no-deps pytorch-lattice==0.2.0`.
+
+Two minutes. `--record` writes `results/bench_lattice.json`; pin the command to a core for steady
+figures: `taskset -c 0 python scripts/benchmarks/bench_lattice.py`.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import statistics
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
-from snn_fusion_failure.runs import enable_compilation_cache, print_result, provenance, write_json
+from snn_fusion_failure.runs import (
+    enable_compilation_cache,
+    print_result,
+    provenance,
+    repository,
+    write_json,
+)
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """What is timed."""
 
+    parts: tuple[Literal["constraints", "peer"], ...] = ("constraints",)
+    """Which parts."""
     steps: int = 200
     """Steps of Adam in one jitted scan."""
     repeats: int = 7
     """Timings of each; the median counts."""
+    ranks: tuple[int, ...] = (6, 8, 10, 12)
+    """Lattices of the second part: 2^rank vertices."""
+    batch: int = 1024
+    """Rows of the second part."""
+    calls: int = 20
+    """Calls in each timing of the second part."""
     seed: int = 0
     out: Path | None = None
     """Folder for `result.json`; nothing is written without it."""
+    record: bool = False
+    """Write `results/bench_lattice.json`."""
 
 
 def _models() -> dict[str, tuple[Any, Any, Any, tuple[int, ...]]]:
@@ -99,45 +122,163 @@ def _train(
     return run
 
 
-def main(config: Config) -> dict[str, float]:
-    """Time all models; returns name -> ratio of CPU time, projected over free."""
+def _alternate(
+    calls: dict[str, Callable[[], Any]], repeats: int, per: int
+) -> dict[str, list[float]]:
+    """CPU microseconds of each call over `per`, `repeats` times in turn, after a first one."""
+    times: dict[str, list[float]] = {name: [] for name in calls}
+    for call in calls.values():
+        call()
+    for _ in range(repeats):
+        for name, call in calls.items():
+            start = time.process_time()
+            call()
+            times[name].append((time.process_time() - start) / per * 1e6)
+    return times
+
+
+def _wait(run: Callable[..., Any], *arguments: Any) -> None:
     import jax
 
-    enable_compilation_cache()
+    jax.block_until_ready(run(*arguments))
+
+
+def constraints(config: Config) -> dict[str, dict[str, float]]:
+    """A step with projection over the step without, for each model."""
+    import jax
+
     key = jax.random.key(config.seed)
     keys = jax.random.split(key, config.steps)
-    ratios: dict[str, float] = {}
     table = {}
     for name, (init, apply, project, shape) in _models().items():
         params = init(key)
-        runs = {
-            "free": _train(apply, None, shape),
-            "projected": _train(apply, project, shape),
+        calls = {
+            kind: functools.partial(_wait, _train(apply, p, shape), params, keys)
+            for kind, p in (("free", None), ("projected", project))
         }
-        times: dict[str, list[float]] = {kind: [] for kind in runs}
-        for run in runs.values():
-            jax.block_until_ready(run(params, keys))
-        for _ in range(config.repeats):
-            for kind, run in runs.items():
-                start = time.process_time()
-                jax.block_until_ready(run(params, keys))
-                times[kind].append((time.process_time() - start) / config.steps * 1e6)
-        free, projected = (statistics.median(times[kind]) for kind in ("free", "projected"))
-        ratios[name] = statistics.median(
-            b / a for a, b in zip(times["free"], times["projected"], strict=True)
-        )
-        table[name] = {"free_us": free, "projected_us": projected, "ratio": ratios[name]}
-        print(
-            f"{name:36s} free {free:8.1f} us  projected {projected:8.1f} us  "
-            f"ratio {ratios[name]:.3f}",
-            flush=True,
-        )
+        times = _alternate(calls, config.repeats, config.steps)
+        pairs = zip(times["free"], times["projected"], strict=True)
+        table[name] = {
+            "free_us": statistics.median(times["free"]),
+            "projected_us": statistics.median(times["projected"]),
+            "ratio": statistics.median(b / a for a, b in pairs),
+        }
+        print(f"{name:36s} ratio {table[name]['ratio']:.3f}", flush=True)
+    return table
+
+
+def _ours(rank: int, dtype: str, table: Any, x: Any) -> dict[str, Callable[[], Any]]:
+    """Forward, and forward with backward, of the lattice layer."""
+    import jax
+    import jax.numpy as jnp
+
+    from fusion.lattice import LatticeConfig, lattice_layer
+    from fusion.lattice.lattice_config import LatticeParams
+
+    config = LatticeConfig((2,) * rank)
+    params, inputs = LatticeParams(jnp.asarray(table, dtype)), jnp.asarray(x, dtype)
+    forward = jax.jit(lambda p, x: lattice_layer.apply(config, p, x))
+    backward = jax.jit(
+        jax.value_and_grad(lambda p, x: jnp.sum(lattice_layer.apply(config, p, x)), (0, 1))
+    )
+    return {
+        "forward": lambda: jax.block_until_ready(forward(params, inputs)),
+        "backward": lambda: jax.block_until_ready(backward(params, inputs)),
+    }
+
+
+def _theirs(rank: int, table: Any, x: Any) -> dict[str, Callable[[], Any]]:
+    """The same by pytorch-lattice, as it is installed: in float64."""
+    import torch
+    from pytorch_lattice.layers import Lattice
+
+    torch.set_num_threads(1)
+    layer = Lattice([2] * rank)
+    layer.kernel = torch.nn.Parameter(torch.tensor(table).double().reshape(-1, 1))
+    inputs = torch.tensor(x).double().requires_grad_()
+
+    def forward() -> Any:
+        with torch.no_grad():
+            return layer(inputs)[:, 0].numpy()
+
+    def backward() -> Any:
+        total = layer(inputs).sum()
+        return total, torch.autograd.grad(total, (layer.kernel, inputs))
+
+    return {"forward": forward, "backward": backward}
+
+
+def peer(config: Config) -> dict[str, dict[str, float]]:
+    """pytorch-lattice's time over ours, for each size; outputs compared first."""
+    import jax
+    import numpy as np
+
+    try:
+        import pytorch_lattice  # noqa: F401
+    except ImportError as error:
+        raise ValueError(
+            "parts=peer: expected torch and pytorch-lattice; install them as --help says"
+        ) from error
+    rng = np.random.default_rng(config.seed)
+    found = {}
+    for rank in config.ranks:
+        table = rng.normal(size=(2,) * rank).astype(np.float32)
+        x = rng.uniform(size=(config.batch, rank)).astype(np.float32)
+        row: dict[str, float] = {"vertices": 2**rank}
+        theirs = _theirs(rank, table, x)
+        for dtype in ("float32", "float64"):
+            with jax.enable_x64(dtype == "float64"):
+                ours = _ours(rank, dtype, table, x)
+                gap = float(np.max(np.abs(np.asarray(ours["forward"]()) - theirs["forward"]())))
+                if gap > 1e-5:
+                    raise ValueError(f"outputs={gap}: expected equal to 1e-5; report it")
+                row[f"largest_difference_{dtype}"] = gap
+                for kind in ("forward", "backward"):
+                    calls = {
+                        side: lambda call=part[kind]: [call() for _ in range(config.calls)]
+                        for side, part in (("ours", ours), ("theirs", theirs))
+                    }
+                    times = _alternate(calls, config.repeats, config.calls)
+                    pairs = zip(times["ours"], times["theirs"], strict=True)
+                    row[f"{kind}_us_{dtype}"] = statistics.median(times["ours"])
+                    row[f"{kind}_us_pytorch_lattice"] = statistics.median(times["theirs"])
+                    row[f"{kind}_ratio_{dtype}"] = statistics.median(b / a for a, b in pairs)
+        found[f"2^{rank}"] = row
+        shown = "  ".join(f"{k} {v:.1f}" for k, v in row.items() if "ratio" in k)
+        print(f"2^{rank:<3d} {shown}", flush=True)
+    return found
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Run the parts; returns what is written."""
+    enable_compilation_cache()
+    result: dict[str, Any] = {"benchmark": "lattice", "batch": config.batch, **provenance()}
+    for name, part in (("constraints", constraints), ("peer", peer)):
+        if name in config.parts:
+            result[name] = part(config)
+    if "peer" in config.parts:
+        from importlib.metadata import version
+
+        peers = {name: version(name) for name in ("torch", "pytorch-lattice")}
+        result["versions"] = {**result["versions"], **peers}
+    if config.record:
+        write_json(repository.RESULTS / "bench_lattice.json", result)
     if config.out is not None:
-        write_json(config.out / "result.json", {"timings": table, **provenance()})
-    return ratios
+        write_json(config.out / "result.json", result)
+    return result
+
+
+def _fields(result: dict[str, Any]) -> dict[str, float]:
+    """Each ratio of the first part; the smallest of the second."""
+    shown = {name: row["ratio"] for name, row in result.get("constraints", {}).items()}
+    rows = result.get("peer", {}).values()
+    for kind in ("forward", "backward"):
+        if rows:
+            shown[f"smallest_{kind}_ratio"] = min(row[f"{kind}_ratio_float32"] for row in rows)
+    return shown
 
 
 if __name__ == "__main__":
     import tyro
 
-    print_result(**main(tyro.cli(Config, description=__doc__)))
+    print_result(**_fields(main(tyro.cli(Config, description=__doc__))))

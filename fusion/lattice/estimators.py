@@ -112,7 +112,9 @@ class _Estimator:
         def train(params: Any, keys: jax.Array) -> Any:
             return jax.lax.scan(step, (params, optimizer.init(params)), keys)
 
-        (self.params_, _), losses = train(params, jax.random.split(draw, steps))
+        # optax mixes types, which a caller's strict rules would forbid.
+        with jax.numpy_dtype_promotion("standard"):
+            (self.params_, _), losses = train(params, jax.random.split(draw, steps))
         self.losses_ = np.asarray(losses)
 
     def _raw(self, x: Any) -> np.ndarray:

@@ -127,14 +127,10 @@ def projection(model: nnx.Module) -> Callable[[Any], Any]:
 
     Example:
         >>> curve = PWLCalibration(PWLConfig(1, 3, monotonicity=1), rngs=nnx.Rngs(0))
-        >>> from fusion.lattice import with_projection
-        >>> optimizer = nnx.Optimizer(
-        ...     curve, with_projection(optax.sgd(1.0), projection(curve)), wrt=nnx.Param
-        ... )
-        >>> gradient = nnx.grad(lambda m: jnp.sum(m(jnp.ones((1, 1)))))(curve)
-        >>> _ = optimizer.update(curve, gradient)
-        >>> float(check_model(curve))
-        0.0
+        >>> arrays = nnx.to_pure_dict(nnx.state(curve, nnx.Param))
+        >>> arrays["outputs"] = jnp.array([[0.0, 2.0, 1.0]])
+        >>> projection(curve)(arrays)["outputs"].tolist()
+        [[0.0, 1.5, 1.5]]
     """
     layers = [(path, m.config, m.names, m.structure) for path, m in _layers(model)]
 

@@ -2,9 +2,12 @@
 
 Every kind of layer is a module of functions: `init(key, config)`, `apply(config, params, x)`,
 `project(config, params)` and `check(config, params)`. Nothing here depends on the rest of
-`fusion`. The layers as flax modules are in `fusion.lattice.linen` and `fusion.lattice.nnx`,
-pictures in `fusion.lattice.plots`; these are imported on their own.
+`fusion`. The layers as flax modules are in `fusion.lattice.linen` and `fusion.lattice.nnx`.
+Pictures are in `fusion.lattice.plots`, which is imported on its own.
 """
+
+import importlib
+from types import ModuleType
 
 from fusion.lattice import (
     categorical,
@@ -12,6 +15,8 @@ from fusion.lattice import (
     ensemble,
     lattice_layer,
     linear,
+    linen,
+    premade,
     pwl,
     regularizers,
 )
@@ -55,3 +60,10 @@ __all__ = [
     "vertices",
     "with_projection",
 ]
+
+
+def __getattr__(name: str) -> ModuleType:
+    # flax.nnx takes a fifth of a second to import, which few programs need to pay.
+    if name == "nnx":
+        return importlib.import_module("fusion.lattice.nnx")
+    raise AttributeError(f"module 'fusion.lattice' has no attribute {name!r}")

@@ -26,11 +26,11 @@ __all__ = [
     "Lattice",
     "Linear",
     "PWLCalibration",
-    "first_params",
+    "init_tagged",
 ]
 
 
-def first_params(key: Array, config: Any, dtype: Any = jnp.float32) -> Tagged:
+def init_tagged(key: Array, config: Any, dtype: Any = jnp.float32) -> Tagged:
     """Tagged parameters of a layer in a given type, feasible in it.
 
     Args:
@@ -54,7 +54,7 @@ class _Layer(nn.Module):
     """What all layers share: a tagged parameter `layer`, and `apply` of its functions."""
 
     def _apply(self, config: Any, x: Array, dtype: Any) -> Array:
-        params = self.param("layer", first_params, config, dtype)
+        params = self.param("layer", init_tagged, config, dtype)
         return layer_of(config).apply(config, params, x)
 
 

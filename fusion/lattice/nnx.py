@@ -21,7 +21,7 @@ from fusion.lattice.deep_lattice import DeepLatticeConfig
 from fusion.lattice.ensemble import EnsembleConfig
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.linear import LinearConfig
-from fusion.lattice.linen import first_params
+from fusion.lattice.linen import init_tagged
 from fusion.lattice.pwl import PWLConfig
 from fusion.lattice.tagged import layer_of
 
@@ -50,7 +50,7 @@ class _Layer(nnx.Module):
 
     def __init__(self, config: Any, *, rngs: nnx.Rngs, param_dtype: Any = jnp.float32) -> None:
         self.config = config
-        params = first_params(rngs.params(), config, param_dtype).value
+        params = init_tagged(rngs.params(), config, param_dtype).value
         for name, leaf in _named(params).items():
             setattr(self, name, nnx.Param(leaf))
         self.names = tuple(_named(params))

@@ -183,9 +183,9 @@ class LatticeClassifier(_Estimator):
 
     Example:
         >>> x = np.linspace(0.0, 1.0, 40)[:, None]
-        >>> model = LatticeClassifier((Feature("x", 1),), n_keypoints=5, epochs=60, batch_size=40)
-        >>> model.fit(x, np.where(x[:, 0] > 0.5, "high", "low")).predict([[0.9]]).tolist()
-        ['high']
+        >>> model = LatticeClassifier((Feature("x", 1),), n_keypoints=5, epochs=90, batch_size=40)
+        >>> model.fit(x, x[:, 0] > 0.5).predict([[0.1], [0.9]]).tolist()
+        [False, True]
     """
 
     def fit(self, X: Any, y: Any) -> LatticeClassifier:

@@ -10,14 +10,13 @@ from __future__ import annotations
 from typing import Any
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from fusion.lattice import categorical, deep_lattice, ensemble, pwl
 from fusion.lattice import linear as linear_layer
 from fusion.lattice.lattice_config import LatticeConfig
-from fusion.lattice.tagged import Tagged, layer_of, tag
+from fusion.lattice.tagged import init_tagged, layer_of
 
 __all__ = [
     "CategoricalCalibration",
@@ -26,28 +25,7 @@ __all__ = [
     "Lattice",
     "Linear",
     "PWLCalibration",
-    "init_tagged",
 ]
-
-
-def init_tagged(key: Array, config: Any, dtype: Any = jnp.float32) -> Tagged:
-    """Tagged parameters of a layer in a given type, feasible in it.
-
-    Args:
-        key: typed key, or the legacy key that many flax programs pass.
-        config: of the layer.
-        dtype: of the parameters.
-
-    Returns:
-        Tagged parameters of `layer_of(config).init`.
-    """
-    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-        key = jax.random.wrap_key_data(key)
-    layer = layer_of(config)
-    params = layer.init(key, config)
-    if jnp.dtype(dtype) != jnp.float32:
-        params = layer.project(config, jax.tree.map(lambda a: a.astype(dtype), params))
-    return tag(config, params)
 
 
 class _Layer(nn.Module):

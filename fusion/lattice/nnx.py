@@ -21,9 +21,8 @@ from fusion.lattice.deep_lattice import DeepLatticeConfig
 from fusion.lattice.ensemble import EnsembleConfig
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.linear import LinearConfig
-from fusion.lattice.linen import init_tagged
 from fusion.lattice.pwl import PWLConfig
-from fusion.lattice.tagged import layer_of
+from fusion.lattice.tagged import init_tagged, layer_of
 
 __all__ = [
     "CategoricalCalibration",

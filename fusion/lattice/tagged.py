@@ -22,7 +22,7 @@ from fusion.lattice import categorical, deep_lattice, ensemble, lattice_layer, l
 from fusion.lattice.checks import refusal
 from fusion.lattice.lattice_config import LatticeConfig
 
-__all__ = ["Tagged", "check_tree", "layer_of", "project_tree", "tag"]
+__all__ = ["Tagged", "check_tree", "init_tagged", "layer_of", "project_tree", "tag"]
 
 LAYERS: dict[type, ModuleType] = {
     pwl.PWLConfig: pwl,
@@ -102,6 +102,26 @@ def tag(config: Any, params: Any) -> Tagged:
     """
     layer_of(config)
     return Tagged(params, config)
+
+
+def init_tagged(key: Array, config: Any, dtype: Any = jnp.float32) -> Tagged:
+    """Tagged parameters of a layer in a given type, feasible in it.
+
+    Args:
+        key: typed key, or the legacy key that many flax programs pass.
+        config: of the layer.
+        dtype: of the parameters.
+
+    Returns:
+        Tagged parameters of `layer_of(config).init`.
+    """
+    if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+        key = jax.random.wrap_key_data(key)
+    layer = layer_of(config)
+    params = layer.init(key, config)
+    if jnp.dtype(dtype) != jnp.float32:
+        params = layer.project(config, jax.tree.map(lambda a: a.astype(dtype), params))
+    return tag(config, params)
 
 
 def _is_tagged(node: Any) -> bool:

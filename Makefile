@@ -3,7 +3,6 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 JOBS   ?= 2
-ROTA   ?= $(shell echo $$(( $$(date +%-j) % 3 )))/3
 # The versions that the suite has passed with; `make CONSTRAINTS= test` takes the newest there are.
 CONSTRAINTS ?= constraints.txt
 INSTALL := -m pip install -q --disable-pip-version-check $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
@@ -14,7 +13,7 @@ PART   ?= $(shell expr $$(date +%j) % 3)/3
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
 
-.PHONY: help demo report test slow slow-rota commands lint types docs wheel lowest check clean
+.PHONY: help demo report test slow commands lint types docs wheel lowest check clean
 .DEFAULT_GOAL := help
 
 help:  ## list the commands
@@ -45,9 +44,6 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 
 slow: $(VENV)/.dev  ## a third of the tests that take minutes each, another third every day
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
-
-slow-rota: $(VENV)/.dev  ## a third of the slow tests, another one every day
-	$(BIN)/python -m pytest -m slow --rota $(ROTA)
 
 commands: $(VENV)/.dev  ## run every command of README and docs at its smallest size, in a copy
 	$(BIN)/python scripts/tools/check_commands.py --jobs $(JOBS)

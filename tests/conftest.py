@@ -6,7 +6,6 @@ import contextlib
 import ctypes
 import gc
 import os
-import zlib
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -69,21 +68,6 @@ def _memory() -> Iterator[None]:
         gc.collect()
         with contextlib.suppress(OSError, AttributeError):
             ctypes.CDLL("libc.so.6").malloc_trim(0)
-
-
-def pytest_addoption(parser: pytest.Parser) -> None:
-    parser.addoption(
-        "--rota", default="0/1", help="i/n: of the selected tests every n-th by name, from i"
-    )
-
-
-def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
-    """With `--rota` a part of the tests; n runs with i from 0 to n - 1 are all of them."""
-    part, _, parts = config.getoption("--rota").partition("/")
-    kept = [i for i in items if zlib.crc32(i.nodeid.encode()) % int(parts) == int(part)]
-    if len(kept) < len(items):
-        config.hook.pytest_deselected(items=[i for i in items if i not in set(kept)])
-        items[:] = kept
 
 
 @pytest.fixture(autouse=True)

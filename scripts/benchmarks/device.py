@@ -98,11 +98,7 @@ def robots(tiny: bool) -> dict[str, Any]:
     import jax
     import jax.numpy as jnp
 
-    from jaxsnn.presets import network_setting
-
-    config, _ = network_setting("S4", "tuned")
-    hidden = config.hidden_exc + config.hidden_inh
-    synapses = 44_308 if not tiny else 1_000
+    synapses = 1_000 if tiny else 44_308  # of S4, all plastic
     copied = bandwidth(tiny)
     rows = []
     for count in (8, 16) if tiny else (1024, 2048, 4096, 8192, 16384):
@@ -124,7 +120,7 @@ def robots(tiny: bool) -> dict[str, Any]:
         rate = count * 10 / seconds
         share = rate * synapses * 9.0 / copied
         rows.append({"robots": count, "robot_ms_per_s": rate, "share_of_bandwidth": share})
-    return {"bytes_per_s": copied, "hidden": hidden, "synapses": synapses, "rows": rows}
+    return {"bytes_per_s": copied, "synapses": synapses, "rows": rows}
 
 
 def fusion_tables(tiny: bool) -> dict[str, Any]:

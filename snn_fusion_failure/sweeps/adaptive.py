@@ -226,7 +226,7 @@ def _gp(sweep: Sweep, rows: Sequence[Row], scores: np.ndarray, count: int) -> li
         z, _, _ = gp.standardize(jnp.asarray(y), jnp.asarray(used))
         n = jnp.asarray(len(rows))
         start = gp_fit.initial_params(config, x.shape[1])
-        fitted = gp_fit.fit(config, jnp.asarray(x), z, n, start).params
+        fitted = gp_fit.fit(config, start, jnp.asarray(x), z, n).params
         z = np.asarray(z).copy()
         top = z[: len(rows)].max()
         found: list[Row] = []

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import collections
 import dataclasses
 from collections.abc import Sequence
 from typing import Any
@@ -38,12 +39,11 @@ def changed_preset(model: str, reading: str, changes: Sequence[str]) -> tuple[An
     config, params = preset(model, reading)
     changes = [_full(change) for change in changes]
     first = [c for c in changes if c.startswith("config.")]
-    changed = apply_changes({"config": config, "params": params}, first)["config"]
-    different = {
-        f.name: getattr(changed, f.name)
-        for f in dataclasses.fields(changed)
-        if getattr(changed, f.name) != getattr(config, f.name)
-    }
+    # Sizes that depend on one another are checked when all of them are changed, not in between.
+    names = [f.name for f in dataclasses.fields(config)]
+    unchecked = collections.namedtuple("unchecked", names)(*(getattr(config, n) for n in names))
+    changed = apply_changes({"config": unchecked, "params": params}, first)["config"]._asdict()
+    different = {n: v for n, v in changed.items() if v != getattr(config, n)}
     config, params = preset(model, reading, config=different)
     rest = [c for c in changes if not c.startswith("config.")]
     params = apply_changes({"config": config, "params": params}, rest)["params"]

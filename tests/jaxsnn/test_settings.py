@@ -34,6 +34,15 @@ def test_changes_reach_their_part():
     assert params.gamma == 5e-4 and config.bounds == "soft" and params.stdp.tau_z == 0.05
 
 
+@pytest.mark.parametrize("order", [1, -1])
+def test_sizes_that_depend_on_one_another_change_together(order):
+    changes = ("config.control_steps=40", "config.hold_steps=20")[::order]
+    config, _ = changed_preset("S4", "tuned", changes)
+    assert (config.control_steps, config.hold_steps) == (40, 20)
+    with pytest.raises(ValueError, match="hold_steps=30: expected a divisor"):
+        changed_preset("S4", "tuned", ("config.hold_steps=30",))
+
+
 @pytest.mark.parametrize("text", ["gamma=1", "params.gamma", "world.speed=1"])
 def test_bad_changes_are_named(text):
     with pytest.raises(ValueError, match=r"expected part\.name=value with part one of config"):

@@ -8,14 +8,14 @@ import numpy as np
 
 from failure import circuits
 from failure.circuits import Circuit, Spec
-from failure.simulators import FunctionSimulator
+from failure.status import Status
 from snn_fusion_failure.sweeps.source import find_function
 
 __all__ = ["find_circuit"]
 
 
 class _OwnCircuit(Circuit):
-    """A circuit whose samples a worker process computes, one after another."""
+    """A circuit whose samples a function computes, one after another, in this process."""
 
     def simulate(self, x: Any) -> Any:
         """Specifications and status of a batch of samples."""
@@ -48,7 +48,13 @@ def find_circuit(name: str, dimensions: int | None = None) -> Circuit:
         raise ValueError(
             f"dimensions={dimensions}: expected how many numbers {name} takes, at least 1"
         )
-    simulator = FunctionSimulator(find_function(name), n_specs=1)
+    function = find_function(name)
+
+    def simulator(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        values = np.asarray([[float(function(row))] for row in x], np.float64)
+        status = np.where(np.isfinite(values[:, 0]), int(Status.GOOD), int(Status.FAILED))
+        return values, status
+
     return _OwnCircuit(
         name=name, parameter_names=tuple((f"x{i}", "sigma") for i in range(dimensions)),
         sigma=(1.0,) * dimensions, parameter_units=("1",) * dimensions,

@@ -166,7 +166,7 @@ def ldo() -> str:
 
     canvas = Canvas(1400, 490, "Low-dropout regulator: 20 transistors and their connections")
     canvas.text(20, 30, "Low-dropout regulator", size=18, anchor="start", bold=True)
-    sources = {e.name: e for e in NETLIST.elements}
+    sources: dict[str, Any] = {e.name: e for e in NETLIST.elements}
     draw_block(canvas, NETLIST.elements, LDO, 10, 80)
     light, heavy = (1e3 * i * math.tanh(1.0 / KNEE) for i in (I_LIGHT, I_HEAVY))
     _notes(

@@ -72,6 +72,10 @@ RULES = (
     ),
     Rule("make demo", not_run="takes minutes and has no smaller size; test_demo.py runs its parts"),
     Rule("make", not_run="runs this or the test suite"),
+    Rule(
+        "sweep.py my_module:trial",
+        not_run="is the reader's own module; check_wheel.py runs such a study",
+    ),
     Rule("pip install", not_run="installs; the Makefile does it"),
     Rule("pytest", not_run="is part of the test suite"),
     # Chapter 2.
@@ -188,6 +192,7 @@ RULES = (
     Rule("sweep.py failure", "--seeds 1 --options n_init=4 n_total=6 candidates=8 refit_every=2"),
     Rule("sweep.py argate", "--seeds 1 --options epochs=1 model=baseline"),
     Rule("sweep.py snn", "--seeds 1 --options max_steps=2 n_learn=1 n_test=2 --chunk-size 1"),
+    Rule("sweep.py", "--study lif --grid drive=16,40 --seeds 1 --out runs/sweep_bare"),
     Rule("bench_sweep.py", "--repeats 2 --writers 1 --workers 1 --steps 100"),
     Rule("python -c"),
 )

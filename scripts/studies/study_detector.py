@@ -78,6 +78,8 @@ class Config:
     changes: choices.Changes = ()
     """Constants of all runs, `detector.path_drop=0` `params.gate.tau=0.2`."""
     learning_rate: float | None = None
+    path_drop: float | None = None
+    """As `--set detector.path_drop=...`."""
     out: Path = Path("runs/study_detector")
     """Folder of the runs."""
     results: Path = repository.RESULTS
@@ -140,11 +142,14 @@ def execute(config: Config) -> int:
     _prepare(config)
     split, done = _split(config), 0
     checked: set[Path] = set()
+    changes = config.changes
+    if config.path_drop is not None:
+        changes = (*changes, f"detector.path_drop={config.path_drop}")
     for model, seed, failure in evaluations(config):
         record, run = _record(config, model, seed, failure), _run_path(config, model, seed)
         options = choices.Train(
             config.data, model, config.size, config.cache, seed=seed, steps=config.steps,  # type: ignore[arg-type]
-            failures=config.failures and not config.real, changes=config.changes,
+            failures=config.failures and not config.real, changes=changes,
             learning_rate=config.learning_rate, out=run,
             resume=(run / "config.json").exists(),
         )  # fmt: skip

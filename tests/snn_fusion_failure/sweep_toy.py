@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import os
 import time
 from pathlib import Path
@@ -72,7 +73,13 @@ def make(
     )
 
 
+def make_uncut() -> Study:
+    """The same without a budget: there is nothing to cut a trial by."""
+    return dataclasses.replace(make(), name="uncut", with_budget=None)
+
+
 NAME = "tests.snn_fusion_failure.sweep_toy:make"
+NO_BUDGET = "tests.snn_fusion_failure.sweep_toy:make_uncut"
 
 
 def work_logged(out: str, log: str) -> None:

@@ -17,7 +17,7 @@ from snn_fusion_failure.sweeps import designs, folder, gather, program, rungs
 from snn_fusion_failure.sweeps.chunks import run_shard
 from snn_fusion_failure.sweeps.folder import done_chunks, held_sweep
 from snn_fusion_failure.sweeps.results import Reader
-from tests.snn_fusion_failure.sweep_toy import NAME
+from tests.snn_fusion_failure.sweep_toy import NAME, NO_BUDGET
 
 LIF = sweep.Config(
     study="lif", options=("steps=60",), grid=("drive=18:40:5", "tau_m=5,20,40"), seeds=3,
@@ -224,8 +224,8 @@ def test_halving_by_shards_is_halving(tmp_path) -> None:
         ({"shard": "4/4"}, "shard='4/4': expected i/n"),
         ({"shard": "0/4", "workers": 2}, "--shard is one process"),
         ({"grid": ("c=1,2",)}, "'c' is no leaf of this study.*a, inner.b, inner.time"),
-        ({"study": "lif", "grid": ("tau_m=0.4",)}, "Euler step would oscillate"),
-        ({"study": "argate", "grid": ("alpha=1",), "halving": (1,)}, "no budget to cut"),
+        ({"study": "lif", "grid": ("tau_m=0.4",)}, "dt=0.001: expected a step below 2 tau_m"),
+        ({"study": NO_BUDGET, "halving": (1,)}, "no budget to cut"),
     ],
 )
 def test_what_cannot_run_is_refused_first(tmp_path, changes, message) -> None:

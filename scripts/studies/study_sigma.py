@@ -215,7 +215,8 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
             case.performance, case.threshold, case.dim, key=key, slopes=slopes
         )
         found = regions.estimate
-        first, cosine = regions.points[0].first_failure, nearest(case, regions.points[0].point)
+        # A descent counts from its own start: there is no count to the first failure of them all.
+        cosine = nearest(case, regions.points[0].point)
     else:
         start = 0.5 * np.random.default_rng(seed).normal(size=case.dim) if seed else None
         design = find_design_point(

@@ -248,7 +248,7 @@ def subset_simulation(
         run = _program(performance, dim, n_chains, length, max_levels)
         key_runs, key_wide = jax.random.split(key)
         runs = run(jnp.asarray(float(threshold)), jax.random.split(key_runs, replicates))
-        runs = _Run(*(np.asarray(part) for part in runs))
+        runs = jax.tree.map(np.asarray, runs)
         strangers = 0
         if explore:
             strangers = _strangers(performance, threshold, dim, explore, runs, key=key_wide)

@@ -152,7 +152,7 @@ def _along_rays(
     ts = np.concatenate([np.zeros((p, 1)), tried], 1)
     gs = np.concatenate([nominal[specs][:, None], own], 1)
     best_t, best_g = np.zeros(p), np.zeros((p, g.shape[2]))
-    failed = (gs > 0.0).any(1)
+    failed = np.asarray((gs > 0.0).any(1))
     for _ in range(3):
         t = np.empty(p)
         for k in range(p):
@@ -224,7 +224,7 @@ def worst_case_points(
         except BudgetSpentError:
             break
         still = []
-        for row, k in enumerate(active):
+        for row, k in enumerate(active.tolist()):
             spec = int(columns[k])
             slope, value = slopes[row, spec], float(np.nan_to_num(g[row, spec], nan=1.0))
             region = Region(

@@ -205,7 +205,7 @@ def mixture_sampling(
         return SpecYield(mean, lower, upper, n, verdict)
 
     specs = [estimate(fails[:, k]) for k in range(n_specs)]
-    union = estimate(fails.any(1))
+    union = estimate(np.asarray(fails.any(1)))
     total = sum(p.probability for p in specs if not math.isnan(p.probability))
     overlap = union.probability / total if total > 0.0 else 1.0
     return Mixture(specs, union, overlap)

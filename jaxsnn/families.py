@@ -135,7 +135,8 @@ def _clutter(
         radius = float(rng.uniform(20, 42))
         centre = rng.uniform([radius, radius], [800 - radius, 600 - radius])
         if all(np.hypot(*(centre - c)) > radius + r for c, r in taken):
-            found.append(regular(*centre.round(1).tolist(), radius, int(rng.integers(3, 6))))
+            x, y = centre.round(1).tolist()
+            found.append(regular(x, y, radius, int(rng.integers(3, 6))))
     return found
 
 

@@ -193,6 +193,7 @@ def fit_rows(y: np.ndarray) -> np.ndarray:
 
 def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
     """Fit hyper-parameters: from the last ones where there are any, else from the priors' mode."""
+    assert config.gp is not None and config.acquisition is not None  # set by `SearchConfig`
     fit = _programs(config.gp, config.acquisition)["fit"]
     seeds, dim = len(config.seeds), x.shape[2]
     old = state.surrogate
@@ -224,6 +225,7 @@ def _fit(config: SearchConfig, state: SearchState, x: Any, y: Any) -> Surrogate:
 
 def _surrogate_ask(config: SearchConfig, state: SearchState) -> SearchState:
     """Fit or append, then maximise the acquisition for all seeds."""
+    assert config.gp is not None and config.acquisition is not None  # set by `SearchConfig`
     programs = _programs(config.gp, config.acquisition)
     n, s = state.n, len(config.seeds)
     q = config.acquisition.batch_size
@@ -253,6 +255,7 @@ def _surrogate_ask(config: SearchConfig, state: SearchState) -> SearchState:
     centres = jnp.asarray(np.take_along_axis(state.u, order[:, :, None], axis=1))
     domain = _stack(_unit_domain(config, state), s)
     if METHODS[config.method].trust_region:
+        assert config.turbo is not None
         dim = state.u.shape[2]
         lengths = [turbo.region_length(config.turbo, row, config.n_init, dim) for row in state.y]
         domain = programs["region"](

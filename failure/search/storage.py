@@ -66,8 +66,9 @@ def identity_of(simulate: Any) -> str:
     if isinstance(own, str):
         return own
     owner = getattr(simulate, "__self__", None)
-    if isinstance(getattr(owner, "name", None), str):
-        return f"{type(owner).__name__} {owner.name}"
+    name = getattr(owner, "name", None)
+    if isinstance(name, str):
+        return f"{type(owner).__name__} {name}"
     held = getattr(getattr(simulate, "_batch", None), "identity", None)
     if isinstance(held, str):
         return held

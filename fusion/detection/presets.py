@@ -3,9 +3,9 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal, NamedTuple, get_args
+from typing import Literal, NamedTuple, cast, get_args
 
-from fusion.detection.config import CAR_SIZES, DETECTORS, DenseConfig, DetectorConfig
+from fusion.detection.config import CAR_SIZES, DETECTORS, DenseConfig, DetectorConfig, DetectorModel
 from fusion.detection.geometry.anchors import AnchorConfig
 from fusion.detection.geometry.bev import BevConfig
 from fusion.detection.learning.params import DetectorParams
@@ -112,11 +112,12 @@ def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
     """
     if model not in DETECTORS:
         raise ValueError(f"model={model!r}: expected one of {', '.join(DETECTORS)}")
+    named = cast(DetectorModel, model)
     if model.startswith("dense"):
         twin = preset(size, model.replace("dense", "avod"))
-        made = twin._replace(config=dataclasses.replace(twin.config, model=model))
+        made = twin._replace(config=dataclasses.replace(twin.config, model=named))
         return _dense(size, made)
-    base = DetectorConfig(model=model)  # type: ignore[arg-type]
+    base = DetectorConfig(model=named)
     rates = DetectorParams()
     if size == "paper":
         return DetectorSetup(base, DetectorTrainConfig(), rates)

@@ -58,7 +58,8 @@ class _Layer(nnx.Module):
     @property
     def params(self) -> Any:
         """The parameters as the functions of the layer take them."""
-        return self.structure.unflatten([getattr(self, name).get_value() for name in self.names])
+        leaves = [getattr(self, name).get_value() for name in self.names]
+        return jax.tree.unflatten(self.structure, leaves)
 
     def __call__(self, x: Shaped[Array, "..."]) -> Shaped[Array, "..."]:
         """The layer's output; see the `linen` module of the same name."""
@@ -142,7 +143,7 @@ def projection(model: nnx.Module) -> Callable[[Any], Any]:
             leaves = [place[name] for name in names]
             if any(_is_masked(leaf) for leaf in leaves):
                 continue
-            moved = layer_of(config).project(config, structure.unflatten(leaves))
+            moved = layer_of(config).project(config, jax.tree.unflatten(structure, leaves))
             for name, leaf in _named(moved).items():
                 place[name] = leaf
         return params

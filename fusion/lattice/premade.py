@@ -152,10 +152,21 @@ class CalibratedConfig:
         signs = tuple(f.sign for f in self.features)
         if self.kind == "linear":
             return linear.LinearConfig(len(signs), monotonicity=signs, normalized=True)
-        common = {"output_range": (0.0, 1.0), "interpolation": self.interpolation}
         if self.kind == "lattice":
-            return LatticeConfig((self.lattice_size,) * len(signs), signs, **common)
-        return ensemble.EnsembleConfig(len(signs), self.subsets, self.lattice_size, signs, **common)
+            return LatticeConfig(
+                (self.lattice_size,) * len(signs),
+                signs,
+                output_range=(0.0, 1.0),
+                interpolation=self.interpolation,
+            )
+        return ensemble.EnsembleConfig(
+            len(signs),
+            self.subsets,
+            self.lattice_size,
+            signs,
+            output_range=(0.0, 1.0),
+            interpolation=self.interpolation,
+        )
 
     @property
     def output(self) -> pwl.PWLConfig:
@@ -254,9 +265,12 @@ def project(config: CalibratedConfig, params: CalibratedParams) -> CalibratedPar
     Returns:
         CalibratedParams with `check(...) == 0`.
     """
-    numbers = params.numbers
+    numbers = None
+    if config.numbers is not None:
+        assert params.numbers is not None
+        numbers = pwl.project(config.numbers, params.numbers)
     return CalibratedParams(
-        None if config.numbers is None else pwl.project(config.numbers, numbers),
+        numbers,
         tuple(
             categorical.project(c, p)
             for c, p in zip(config.categories, params.categories, strict=True)
@@ -273,6 +287,7 @@ def check(config: CalibratedConfig, params: CalibratedParams) -> Float[Array, ""
         pwl.check(config.output, params.output),
     ]
     if config.numbers is not None:
+        assert params.numbers is not None
         parts.append(pwl.check(config.numbers, params.numbers))
     pairs = zip(config.categories, params.categories, strict=True)
     parts += [categorical.check(c, p) for c, p in pairs]

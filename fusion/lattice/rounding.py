@@ -85,18 +85,20 @@ def frame(
         sides = [jnp.asarray(side, kind) for side in inner]
         return Frame(jnp.asarray(step, kind), jnp.asarray(0.5 * sum(inner), kind), *sides)
     wide = working(values)
-    keep = {"axis": axis, "keepdims": axis is not None}
-    largest = jnp.max(jnp.abs(wide), **keep)
+    keepdims = axis is not None
     given = [abs(side) for side in (low, high) if side is not None]
-    largest = jnp.maximum(largest, jnp.asarray(max([*given, 1e-30]), kind))
+    size = jnp.maximum(
+        jnp.max(jnp.abs(wide), axis=axis, keepdims=keepdims),
+        jnp.asarray(max([*given, 1e-30]), kind),
+    )
     bits = _SPARE_BITS.get(str(values.dtype), _SPARE_BITS_HALF)
-    step = _power_of_two_below(largest) * jnp.asarray(eps * 2.0**bits, kind)
-    step = jnp.maximum(step, jnp.asarray(smallest, kind))
+    unit = _power_of_two_below(size) * jnp.asarray(eps * 2.0**bits, kind)
+    unit = jnp.maximum(unit, jnp.asarray(smallest, kind))
     return Frame(
-        step,
-        jnp.mean(wide, **keep),
-        None if low is None else jnp.ceil(jnp.asarray(low, kind) / step) * step,
-        None if high is None else jnp.floor(jnp.asarray(high, kind) / step) * step,
+        unit,
+        jnp.mean(wide, axis=axis, keepdims=keepdims),
+        None if low is None else jnp.ceil(jnp.asarray(low, kind) / unit) * unit,
+        None if high is None else jnp.floor(jnp.asarray(high, kind) / unit) * unit,
     )
 
 

@@ -172,10 +172,10 @@ class DenseAuxiliary(nn.Module):
 def _shapes(config: DetectorConfig) -> Inputs:
     """Shapes of a batch of one frame, as far as the network reads it."""
 
-    def of(*sides: int) -> jax.ShapeDtypeStruct:
+    def of(*sides: int) -> Any:  # lazy initialisation takes shapes for arrays
         return jax.ShapeDtypeStruct((1, *sides), jnp.float32)
 
-    none: Any = of(1)
+    none = of(1)
     return Inputs(
         image=of(*config.image_size, 3), bev=of(*config.bev.shape, config.bev.n_slices + 1),
         anchors=none, anchor_mask=none, n_occupied=none, p2=of(3, 4), image_size=of(2),

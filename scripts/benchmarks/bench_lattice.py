@@ -20,7 +20,7 @@ import dataclasses
 import functools
 import statistics
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from pathlib import Path
 from typing import Any, Literal
 
@@ -123,7 +123,7 @@ def _train(
 
 
 def _alternate(
-    calls: dict[str, Callable[[], Any]], repeats: int, per: int
+    calls: Mapping[str, Callable[[], Any]], repeats: int, per: int
 ) -> dict[str, list[float]]:
     """CPU microseconds of each call over `per`, `repeats` times in turn, after a first one."""
     times: dict[str, list[float]] = {name: [] for name in calls}
@@ -135,6 +135,10 @@ def _alternate(
             call()
             times[name].append((time.process_time() - start) / per * 1e6)
     return times
+
+
+def _repeat(call: Callable[[], Any], count: int) -> list[Any]:
+    return [call() for _ in range(count)]
 
 
 def _wait(run: Callable[..., Any], *arguments: Any) -> None:
@@ -235,7 +239,7 @@ def peer(config: Config) -> dict[str, dict[str, float]]:
                 row[f"largest_difference_{dtype}"] = gap
                 for kind in ("forward", "backward"):
                     calls = {
-                        side: lambda call=part[kind]: [call() for _ in range(config.calls)]
+                        side: functools.partial(_repeat, part[kind], config.calls)
                         for side, part in (("ours", ours), ("theirs", theirs))
                     }
                     times = _alternate(calls, config.repeats, config.calls)

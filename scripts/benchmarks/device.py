@@ -13,6 +13,7 @@ package or data set, or a part that ran out of time, is a line in its file, not 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import json
 import os
 import subprocess
@@ -100,7 +101,7 @@ def robots(tiny: bool) -> dict[str, Any]:
 
     synapses = 1_000 if tiny else 44_308  # of S4, all plastic
     copied = bandwidth(tiny)
-    rows = []
+    rows: list[dict[str, Any]] = []
     for count in (8, 16) if tiny else (1024, 2048, 4096, 8192, 16384):
         w = jnp.zeros((count, synapses), jnp.float32)
         spikes = jnp.ones((count, synapses), bool)
@@ -113,7 +114,7 @@ def robots(tiny: bool) -> dict[str, Any]:
             return jax.lax.scan(step, w, jnp.arange(10, dtype=jnp.float32))[0]
 
         try:
-            seconds = _timed(lambda w=w, s=spikes, f=window: f(w, s), 3)
+            seconds = _timed(functools.partial(window, w, spikes), 3)
         except Exception as error:
             rows.append({"robots": count, "error": str(error).splitlines()[0][:200]})
             continue
@@ -163,7 +164,7 @@ def circuit_samples(tiny: bool) -> dict[str, Any]:
     for batch in (2,) if tiny else (64, 512, 4096):
         x = np.random.default_rng(0).normal(size=(batch, ldo.n_dims))
         with jax.enable_x64(True):
-            seconds = _timed(lambda x=x: ldo.simulate(x), 1 if tiny else 3)
+            seconds = _timed(functools.partial(ldo.simulate, x), 1 if tiny else 3)
         rows.append({"batch": batch, "samples_per_s": batch / seconds})
     return {"rows": rows}
 

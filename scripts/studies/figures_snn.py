@@ -62,6 +62,8 @@ def draw_rules(config: Figures) -> None:
 
 def draw_trajectories(config: Figures, scenario: int) -> Any:
     """Trials of both phases of one robot (2.9 to 2.14); returns the experiment."""
+    import numpy as np
+
     from jaxsnn import plots, scenarios
     from jaxsnn.experiment import TEST_TRIALS, learning_circles, make_runner
     from jaxsnn.presets import preset
@@ -76,10 +78,12 @@ def draw_trajectories(config: Figures, scenario: int) -> Any:
     experiment = run([config.seed], params)
     for name, index in PHASES.items():
         phase = experiment[index]
+        assert phase is not None and phase.poses is not None, "asked for: record=True"
+        poses = np.asarray(phase.poses)
         steps, status = phase.steps[0], phase.status[0]
         figure = plots.plot_trajectories(
             map,
-            [phase.poses[0, i, : n + 1, :2] for i, n in enumerate(steps)],
+            [poses[0, i, : n + 1, :2] for i, n in enumerate(steps)],
             arrived=[bool(s == Status.ARRIVED) for s in status],
             collided=[bool(s == Status.COLLIDED) for s in status],
             title=f"{config.model}, Scenario {scenario}, {name}",

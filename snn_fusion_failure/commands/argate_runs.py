@@ -152,7 +152,7 @@ def build_cases(config: Config, dataset: Dataset) -> dict[str, Case]:
                 f"{option}={getattr(config, option)}: expected --protocol generalisation with it; "
                 "leave it out"
             )
-    made = {}
+    made: dict[str, Case] = {}
     for name in names:
         train, test, title = _protocols(config, dataset, name)
         noise = Corruption(train, test, config.kind, redraw=config.redraw)

@@ -227,16 +227,16 @@ def _gp(sweep: Sweep, rows: Sequence[Row], scores: np.ndarray, count: int) -> li
         n = jnp.asarray(len(rows))
         start = gp_fit.initial_params(config, x.shape[1])
         fitted = gp_fit.fit(config, start, jnp.asarray(x), z, n).params
-        z = np.asarray(z).copy()
-        top = z[: len(rows)].max()
+        outputs = np.asarray(z).copy()
+        top = outputs[: len(rows)].max()
         found: list[Row] = []
         for place in range(len(rows), len(rows) + count):
             posterior = gp.condition(
-                config, fitted, jnp.asarray(x), jnp.asarray(z), jnp.asarray(place)
+                config, fitted, jnp.asarray(x), jnp.asarray(outputs), jnp.asarray(place)
             )
             mean, variance = gp.predict(config, posterior, candidates)
             value = acquisition.log_ei(mean, jnp.sqrt(variance), jnp.asarray(top))
             chosen = int(jnp.argmax(value))
             found.append(pool[chosen])
-            x[place], z[place] = np.asarray(candidates[chosen]), float(mean[chosen])
+            x[place], outputs[place] = np.asarray(candidates[chosen]), float(mean[chosen])
     return found

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Mapping, Sequence
 from typing import Any
 
@@ -49,7 +50,7 @@ def read_axes(
         for text in given[kind]:
             axis = parse_axis(
                 text,
-                lambda leaf, kind=kind, text=text: _kind_of(leaf, kind, text, study),
+                functools.partial(_kind_of, option=kind, text=text, study=study),
                 study.unit_of if study else lambda leaf: "",
             )
             axes.append(axis._replace(every=kind == "grid" and bool(drawn)))

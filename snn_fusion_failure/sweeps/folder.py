@@ -227,7 +227,8 @@ def _differences(held: Mapping[str, Any], wanted: Mapping[str, Any]) -> list[str
             keys = sorted(k for k in {*old, *new} if old.get(k) != new.get(k))
             found += [f"{k}: {old.get(k)!r} -> {new.get(k)!r}" for k in keys]
         elif name == "axes":
-            found.append("axes: " + " -> ".join(" ".join(a["leaf"] for a in x) for x in (old, new)))
+            both = (held[name], wanted[name])
+            found.append("axes: " + " -> ".join(" ".join(a["leaf"] for a in x) for x in both))
         else:
             found.append(f"{name}: {old!r} -> {new!r}")
     return found
@@ -264,7 +265,10 @@ def held_sweep(out: Path, *, load: bool = False, **changes: Any) -> Sweep:
     if s.get("scheme") != SCHEME:
         raise ValueError(f"out={out}: an older version made this sweep; read its results.nc")
     plan = read_plan(out)
-    kind, axes, rows, seeds, extra = "grid", (), (), 1, {}
+    kind, seeds = "grid", 1
+    axes: tuple[Axis, ...] = ()
+    rows: tuple[tuple[Any, ...], ...] = ()
+    extra: dict[str, Any] = {}
     if plan:
         asked = plan[-1]["design"]
         kind, seeds, extra = asked["kind"], asked["seeds"], asked

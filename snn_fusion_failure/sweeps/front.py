@@ -10,7 +10,7 @@ from snn_fusion_failure.runs import WorkFailedError, enable_compilation_cache
 from snn_fusion_failure.sweeps.axes import Axis
 from snn_fusion_failure.sweeps.engine import Layout, build, collect, describe, execute, open_sweep
 from snn_fusion_failure.sweeps.study import Metric, Study, load_study
-from snn_fusion_failure.sweeps.trial import from_trial
+from snn_fusion_failure.sweeps.trial import Trial, from_trial
 from snn_fusion_failure.sweeps.worker import brief
 
 __all__ = ["axes_of", "sweep"]
@@ -113,15 +113,14 @@ def sweep(
     from snn_fusion_failure.sweeps.launchers import launch_local
 
     enable_compilation_cache()
-    if isinstance(trial, str):
-        trial = load_study(trial)
+    loaded: Trial | Study = load_study(trial) if isinstance(trial, str) else trial
     if goal and goal not in ("max", "min"):
         raise ValueError(f"goal={goal!r}: expected 'max' or 'min'")
-    if isinstance(trial, Study):
-        study, axes = trial, axes_of(space, trial)
+    if isinstance(loaded, Study):
+        study, axes = loaded, axes_of(space, loaded)
     else:
         axes = axes_of(space)
-        study = from_trial(trial, axes, metrics=metrics, objective=objective)
+        study = from_trial(loaded, axes, metrics=metrics, objective=objective)
     if objective or goal:
         study = with_objective(study, objective, goal)
     kind = design or ("sobol" if samples else "grid")

@@ -213,7 +213,8 @@ def launch_ray(
         )(_Actor)
         out = str(sweep.out.resolve())
         crew = [actor.remote(out, sweep.allow_mixed, sweep.lease) for _ in range(workers)]
-        reader, given_up = Reader(sweep.out), set()
+        reader = Reader(sweep.out)
+        given_up: set[tuple[int, int]] = set()
         while True:
             planned = [(s.number, c) for s, c in all_chunks(sweep)]
             done = done_chunks(sweep.out)
@@ -222,7 +223,8 @@ def launch_ray(
                 if given_up or not next_work(sweep, reader):
                     return errors
                 continue
-            free, running = list(crew), {}
+            free = list(crew)
+            running: dict[Any, tuple[Any, tuple[int, int]]] = {}
             while waiting or running:
                 while waiting and free:
                     one, place = free.pop(), waiting.pop(0)

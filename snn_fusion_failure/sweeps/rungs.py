@@ -204,9 +204,9 @@ def derive(sweep: Sweep, reader: Reader, *, idle: bool = False) -> Work | None:
     rows = [tuple(row) for part in plan for row in part["rows"]]
     segments = segments_of(plan)
     if sweep.mode == "asha" and sweep.budgets:
-        found = _asha(sweep, reader, rows, segments, idle=idle)
-        if found or idle:
-            return ([], found) if found else None
+        promoted = _asha(sweep, reader, rows, segments, idle=idle)
+        if promoted or idle:
+            return ([], promoted) if promoted else None
     if idle:
         return None
     if sweep.budgets:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import contextlib
 import time
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from snn_fusion_failure.sweeps.chunkfile import DamagedError
@@ -88,7 +88,7 @@ class WandB:
         self._run.finish()
 
 
-TRACKERS = {
+TRACKERS: dict[str, tuple[Callable[[Sweep], Tracker], str]] = {
     "tensorboard": (TensorBoard, "tensorboardX"),
     "mlflow": (MLflow, "mlflow"),
     "wandb": (WandB, "wandb"),
@@ -101,7 +101,8 @@ class _Watcher:
 
     def __init__(self, sweep: Sweep, tracker: Tracker | None, every: float) -> None:
         self._sweep, self._tracker, self._every = sweep, tracker, every
-        self._reader, self._sent = Reader(sweep.out), set()
+        self._reader = Reader(sweep.out)
+        self._sent: set[int] = set()
         self._last = 0.0
 
     def look(self, *, now: bool = False) -> None:

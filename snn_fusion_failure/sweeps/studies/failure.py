@@ -116,13 +116,13 @@ def make(
     # One after another whatever the chunk size: a batched factorisation is no faster on a CPU, and
     # a search amplifies its last bits.
     def run(params: Any, keys: Any) -> Any:
-        return jax.lax.map(lambda xs: trial(*xs, None, 0, n_total)[1], (params, keys))
+        return jax.lax.map(lambda xs: trial(xs[0], xs[1], None, 0, n_total)[1], (params, keys))
 
     def begin_all(params: Any, keys: Any) -> Any:
-        return jax.lax.map(lambda xs: trial(*xs, None, 0, n_init)[0], (params, keys))
+        return jax.lax.map(lambda xs: trial(xs[0], xs[1], None, 0, n_init)[0], (params, keys))
 
     def advance(params: Any, keys: Any, carry: Any, begin: int, end: int) -> Any:
-        return jax.lax.map(lambda xs: trial(*xs, begin, end), (params, keys, carry))
+        return jax.lax.map(lambda xs: trial(xs[0], xs[1], xs[2], begin, end), (params, keys, carry))
 
     def check(params: SearchParams) -> None:
         for name, low, high in (("size", 0.0, 6.0), ("weight", -1e-9, 1.0), ("region", 0.0, 1.0)):

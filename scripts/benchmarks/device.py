@@ -1,7 +1,7 @@
 """One prepared run for an accelerator: what was never measured on one, most valuable first.
 
     python scripts/benchmarks/device.py --minutes 8 --out OUT
-    python scripts/benchmarks/device.py --tiny --out OUT     a CPU, the smallest sizes
+    python scripts/benchmarks/device.py --tiny --out OUT   # a CPU, the smallest sizes
 
 Each part runs in a process of its own within what is left of the time, and writes OUT/PART.json as
 soon as it ends: parity of the golden tests at highest precision; steps of a batch of spiking

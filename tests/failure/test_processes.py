@@ -73,8 +73,8 @@ def test_nothing_is_left_when_the_parent_ends(how: signal.Signals, tmp_path: Pat
 
 def test_a_time_limit_ends_what_the_program_has_started(tmp_path: Path) -> None:
     pids = tmp_path / "pids"
-    done = Group().run(["sh", "-c", SIMULATOR.format(pids=pids)], timeout=0.5)
-    assert done.returncode is None and done.seconds < 20.0
+    done = Group().run(["sh", "-c", SIMULATOR.format(pids=pids)], timeout=5.0)
+    assert done.returncode is None and done.seconds < 60.0
     assert gone(started(pids, 2))
 
 

@@ -146,14 +146,15 @@ def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str,
         if errors:
             raise RuntimeError(f"{count} workers: {errors}")
         cpu = after.ru_utime + after.ru_stime - before.ru_utime - before.ru_stime
-        assert collect(made)[1]["complete"]
+        summary = collect(made)[1]
+        assert summary["complete"]
         with xr.open_dataset(made.out / "results.nc") as data:
             inside = float(data.attrs["compute_seconds"])
         found[str(count)] = {
             "wall_s": time.perf_counter() - start,
             "cpu_s": cpu + time.process_time() - own,
             "in_chunks_s": inside,
-            "trials": made.n_trials,
+            "trials": summary["trials"],
             "load_average": os.getloadavg()[0],
         }
     return found

@@ -76,6 +76,7 @@ RULES = (
         "sweep.py my_module:trial",
         not_run="is the reader's own module; check_wheel.py runs such a study",
     ),
+    Rule("sweep.py show runs/mine", not_run="shows the sweep of the reader's own module"),
     Rule("pip install", not_run="installs; the Makefile does it"),
     Rule("pytest", not_run="is part of the test suite"),
     # Chapter 2.

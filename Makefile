@@ -64,7 +64,7 @@ wheel: $(VENV)/.dev  ## build the wheel and import it from outside the repositor
 lowest: $(VENV)/.dev  ## a few test files with the lowest allowed versions, in an environment of their own
 	$(BIN)/python scripts/tools/check_lowest.py
 
-check: lint types docs wheel test slow commands lowest  ## everything; CI leaves slow and lowest out
+check: lint types docs wheel test slow commands lowest  ## everything; CI runs a part of commands and leaves slow and lowest out
 
 clean:  ## remove what the other commands made, but not runs/ or results/
 	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,7 +1,7 @@
 """Install the lowest allowed versions into an empty environment and run a few test files with them.
 
     python scripts/tools/check_lowest.py
-    python scripts/tools/check_lowest.py --keep /tmp/lowest
+    python scripts/tools/check_lowest.py --keep runs/lowest
 
 The versions are the lower bounds of `pyproject.toml`. Takes a few minutes, mostly for installing
 and compiling; the test files touch each dependency once.

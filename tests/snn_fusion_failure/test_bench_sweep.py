@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 
 import pytest
 
+from snn_fusion_failure.sweeps.capacity import in_processes
+from snn_fusion_failure.sweeps.queueing import simulate
 from tests._scripts import load_script
 
 bench_sweep = load_script("benchmarks/bench_sweep")
-simulate = load_script("benchmarks/bench_sweep").simulate
 
 
 def test_one_worker_never_waits() -> None:
@@ -49,3 +51,13 @@ def test_measurements_on_a_small_folder(tmp_path) -> None:
     assert result["file_s"] == 1.0 / result["files_per_second_by_writers"]["1"]
     assert len(result["simulated"]) == 3 * 5 * 2
     assert [p.name for p in tmp_path.iterdir()] == ["bench.json"]  # tidied up
+
+
+def test_a_process_that_dies_is_an_error_and_not_a_wait() -> None:
+    with pytest.raises(RuntimeError, match=r"_exit.*a process died"):
+        in_processes(os._exit, [(3,)], 1)
+
+
+def test_a_function_that_no_process_can_import_is_an_error_and_not_a_wait() -> None:
+    with pytest.raises(RuntimeError, match="a new process can import"):
+        in_processes(bench_sweep.sweep_times, [()], 1)

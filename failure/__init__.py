@@ -3,8 +3,8 @@
 What is listed here is kept stable; the rest of the package may change.
 
 - Simulators: `circuits.get(name)`, `CommandSimulator`, `FunctionSimulator`, `Status`.
-- Search: `Task`, `SearchConfig`, `METHODS`, `run_search`, `start_from`, or `ask` and `tell` by
-  hand; `GPConfig`, `AcquisitionConfig`, `TurboConfig`; `first_hit`, `best_so_far`.
+- Search: `Task`, `SearchConfig`, `run_search`, `start_from`, `side_by_side`, or `init_search`,
+  `ask` and `tell` by hand; `GPConfig`, `AcquisitionConfig`; `first_hit`, `best_so_far`.
 - How likely: `design_points`, `importance_sampling`, `subset_simulation`, `monte_carlo`.
 
 Imported by name only, for what they bring along: `failure.rev_argate` (the fusion package),
@@ -17,43 +17,36 @@ from failure.models.acquisition import AcquisitionConfig
 from failure.models.kernels import GPConfig
 from failure.rare_events import Estimate, importance_sampling, monte_carlo, subset_simulation
 from failure.search.bayesopt import ask, tell
-from failure.search.history import SearchState, best_so_far, first_hit
-from failure.search.methods import METHODS, SearchConfig
+from failure.search.bayesopt import init as init_search
+from failure.search.history import best_so_far, first_hit
+from failure.search.methods import SearchConfig
 from failure.search.runs import run as run_search
-from failure.search.runs import samples, start_from
+from failure.search.runs import start_from
 from failure.search.sharing import side_by_side
-from failure.search.subspace import subspace_of_gradient
 from failure.search.task import Task
-from failure.search.thresholds import reachable
-from failure.search.turbo import TurboConfig
 from failure.simulators.wrappers import CommandSimulator, FunctionSimulator
 from failure.status import Status
 
 __all__ = [
-    "METHODS",
     "AcquisitionConfig",
     "CommandSimulator",
     "Estimate",
     "FunctionSimulator",
     "GPConfig",
     "SearchConfig",
-    "SearchState",
     "Status",
     "Task",
-    "TurboConfig",
     "ask",
     "best_so_far",
     "circuits",
     "design_points",
     "first_hit",
     "importance_sampling",
+    "init_search",
     "monte_carlo",
-    "reachable",
     "run_search",
-    "samples",
     "side_by_side",
     "start_from",
     "subset_simulation",
-    "subspace_of_gradient",
     "tell",
 ]

@@ -1,52 +1,48 @@
 """Spiking networks that learn to steer a robot by reward-modulated STDP, and the robot's world.
 
-The names below are the public ones. Kernels: `neurons`, `plasticity`, `window`, `encoding`.
-Network: `config`, `presets`, `agents`. World: `maps`, `scenarios`, `planner`, and `world`, whose
-`reset`, `observe` and `step` move one robot. All together: `trials`, `experiment`, `qlearning`.
-Imported by name only, for what they bring along: `jaxsnn.ppo` and `jaxsnn.navigation` (flax,
+The names listed below are the public ones; the rest of the package may change.
+
+- Kernels: `LIFParams` and `lif_init`, `lif_step`, `lif_scan`; `STDPParams` and `stdp_init`,
+  `stdp_step`, or `stdp_kernel`, `stdp_window`; `apply_reward`, `poisson_spikes`.
+- Networks that steer: `preset`, `snn_params`, `snn_agent`, or an `Agent` of one's own from
+  `reinforce` and `terminal_reward`.
+- The robot's world: `scenario`, `detour`, `make_map`, `random_map`; `world.reset`, `world.observe`
+  and `world.step` move one robot; `drive` for drivers that do not learn.
+- Trials: `run_experiment`, `run_phase`, `success_rate`, `Status`.
+
+Imported by their full path, for what they bring along: `jaxsnn.ppo` and `jaxsnn.navigation` (flax,
 optax), `jaxsnn.plots` (matplotlib), `jaxsnn.brax_env` (brax).
 """
 
-from jaxsnn.agents import Agent, SNNParams, snn_agent, snn_params
-from jaxsnn.config import NetworkConfig, NetworkParams, Weights
-from jaxsnn.drivers import DriverParams, drive
+from jaxsnn import world
+from jaxsnn.agents import Agent, snn_agent, snn_params
+from jaxsnn.config import NetworkConfig, NetworkParams
+from jaxsnn.drivers import drive
 from jaxsnn.encoding import poisson_spikes
-from jaxsnn.experiment import Experiment, run_experiment
-from jaxsnn.families import family_map
-from jaxsnn.maps import make_map, random_map, stack_maps
-from jaxsnn.neurons import LIFParams, LIFState, lif_init, lif_scan, lif_step
-from jaxsnn.planner import shortest_path
-from jaxsnn.plasticity import STDPParams, STDPState, apply_reward, stdp_init, stdp_step
+from jaxsnn.experiment import run_experiment
+from jaxsnn.maps import make_map, random_map
+from jaxsnn.network import reinforce
+from jaxsnn.neurons import LIFParams, lif_init, lif_scan, lif_step
+from jaxsnn.plasticity import STDPParams, apply_reward, stdp_init, stdp_step
 from jaxsnn.presets import preset
-from jaxsnn.qlearning import QParams
-from jaxsnn.rewards import RewardParams
+from jaxsnn.rewards import terminal_reward
 from jaxsnn.scenarios import detour, scenario
 from jaxsnn.status import Status
-from jaxsnn.trials import TrialResult, run_phase, success_rate
+from jaxsnn.trials import run_phase, success_rate
 from jaxsnn.window import stdp_kernel, stdp_window
 from jaxsnn.world import WorldParams
 
 __all__ = [
     "Agent",
-    "DriverParams",
-    "Experiment",
     "LIFParams",
-    "LIFState",
     "NetworkConfig",
     "NetworkParams",
-    "QParams",
-    "RewardParams",
-    "SNNParams",
     "STDPParams",
-    "STDPState",
     "Status",
-    "TrialResult",
-    "Weights",
     "WorldParams",
     "apply_reward",
     "detour",
     "drive",
-    "family_map",
     "lif_init",
     "lif_scan",
     "lif_step",
@@ -54,16 +50,17 @@ __all__ = [
     "poisson_spikes",
     "preset",
     "random_map",
+    "reinforce",
     "run_experiment",
     "run_phase",
     "scenario",
-    "shortest_path",
     "snn_agent",
     "snn_params",
-    "stack_maps",
     "stdp_init",
     "stdp_kernel",
     "stdp_step",
     "stdp_window",
     "success_rate",
+    "terminal_reward",
+    "world",
 ]

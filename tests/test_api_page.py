@@ -13,6 +13,8 @@ from snn_fusion_failure.documentation.reading import Module
 ROOMS = ("jaxsnn", "fusion", "failure", "snn_fusion_failure")
 MODULES = [m for room in ROOMS for m in reading.public_modules(room)]
 NAMES = [name for package in api.PACKAGES for name in api.listed(package)]
+# A list that grows stops being a promise: what comes in takes the place of something.
+LISTED = 125
 
 # A function that takes or gives arrays says what it computes by an equation, a shape or a source.
 # Those below take or give trees of parameters, for which the summary says all there is.
@@ -35,10 +37,6 @@ def signature_text(node: ast.FunctionDef) -> str:
 def test_the_list_is_short_enough_to_keep() -> None:
     count = {package: len(api.listed(package)) for package in api.PACKAGES}
     assert 90 <= sum(count.values()) <= LISTED, count
-
-
-# About 120 names are wanted; this only ever falls.
-LISTED = 190
 
 
 def test_pages_of_public_names_are_up_to_date() -> None:

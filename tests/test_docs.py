@@ -19,7 +19,7 @@ from typing import Any
 import pytest
 import tyro
 
-from snn_fusion_failure.documentation import documented, imports, reading
+from snn_fusion_failure.documentation import api, documented, imports, reading
 from snn_fusion_failure.documentation.documented import (
     PAGES,
     ROOT,
@@ -88,6 +88,59 @@ def test_examples_import_what_is_there(page: Path) -> None:
         for node in ast.walk(ast.parse(code)):
             if isinstance(node, ast.ImportFrom | ast.Import):
                 assert _missing(node) == [], f"{page.name}, line {line + node.lineno}"
+
+
+HOMES = {f"{name.home}.{name.inner}": name.path for p in api.PACKAGES for name in api.listed(p)}
+LISTED = {name.path for package in api.PACKAGES for name in api.listed(package)}
+
+
+def _not_promised(node: ast.ImportFrom | ast.Import, *, tutorial: bool) -> list[str]:
+    """Names that a reader should not learn: public ones by another path, or not public ones."""
+    if isinstance(node, ast.Import):
+        return [
+            a.name
+            for a in node.names
+            if a.name.split(".")[0] in imports.ROOMS and a.name not in {*api.PACKAGES, *api.BY_PATH}
+        ]
+    wrong = []
+    module = node.module or ""
+    for name in (f"{module}.{a.name}" for a in node.names):
+        if module.split(".")[0] not in imports.ROOMS or name in {*LISTED, *api.BY_PATH}:
+            continue
+        if module in api.PACKAGES:
+            wrong.append(f"{name} is not public: list it, or use the full path of its module")
+        elif name in HOMES:
+            wrong.append(f"{name} is public as {HOMES[name]}")
+        elif tutorial and not f"{module}.".startswith(tuple(f"{m}." for m in api.BY_PATH)):
+            wrong.append(f"{name} is in no module of api.BY_PATH")
+    return wrong
+
+
+@pytest.mark.parametrize("page", PAGES, ids=page_name)
+def test_examples_use_public_names_or_full_paths(page: Path) -> None:
+    for _, code, line in blocks(page):
+        for node in ast.walk(ast.parse(code)):
+            if isinstance(node, ast.ImportFrom | ast.Import):
+                found = _not_promised(node, tutorial=page in TUTORIALS)
+                assert found == [], f"{page.name}, line {line + node.lineno}"
+
+
+@pytest.mark.parametrize(
+    ("code", "good"),
+    [
+        ("from jaxsnn import lif_step", True),
+        ("from jaxsnn.neurons import lif_step", False),
+        ("from jaxsnn import scenarios", False),
+        ("from jaxsnn.ppo import PPOConfig", True),
+        ("from jaxsnn.running_mean import update", False),
+        ("import jaxsnn", True),
+        ("import jaxsnn.maps", False),
+    ],
+)
+def test_the_rule_of_names_itself(code: str, good: bool) -> None:
+    (node,) = ast.parse(code).body
+    assert isinstance(node, ast.ImportFrom | ast.Import)
+    assert (_not_promised(node, tutorial=True) == []) is good
 
 
 def slug(heading: str) -> str:

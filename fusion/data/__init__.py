@@ -6,64 +6,12 @@ from pathlib import Path
 
 from fusion._checks import check_choice
 from fusion.data.arrays import from_arrays
-from fusion.data.dataset import (
-    Dataset,
-    Scale,
-    apply_scale,
-    check_dataset,
-    draw_groups,
-    fit_scale,
-    validation_split,
-)
-from fusion.data.driver import (
-    DRIVER_CHANNELS,
-    DRIVER_CLASSES,
-    DRIVER_REPLACEMENTS,
-    DRIVER_SOURCE_CHANNELS,
-    load_driver,
-)
-from fusion.data.fixed import (
-    DRIVER_FIXED_CLEAN,
-    HAR_FIXED_FAILING,
-    fixed_sets,
-    published_fixed,
-)
-from fusion.data.har import HAR_CHANNELS, HAR_CLASSES, load_har
-from fusion.data.simulated import (
-    SimulatedConfig,
-    bayes_accuracy,
-    load_simulated,
-    oracle_accuracy,
-)
+from fusion.data.dataset import Dataset, validation_split
+from fusion.data.driver import load_driver
+from fusion.data.har import load_har
+from fusion.data.simulated import load_simulated
 
-__all__ = [
-    "DATASETS",
-    "DRIVER_CHANNELS",
-    "DRIVER_CLASSES",
-    "DRIVER_FIXED_CLEAN",
-    "DRIVER_REPLACEMENTS",
-    "DRIVER_SOURCE_CHANNELS",
-    "HAR_CHANNELS",
-    "HAR_CLASSES",
-    "HAR_FIXED_FAILING",
-    "Dataset",
-    "Scale",
-    "SimulatedConfig",
-    "apply_scale",
-    "bayes_accuracy",
-    "check_dataset",
-    "draw_groups",
-    "fit_scale",
-    "fixed_sets",
-    "from_arrays",
-    "load",
-    "load_driver",
-    "load_har",
-    "load_simulated",
-    "oracle_accuracy",
-    "published_fixed",
-    "validation_split",
-]
+__all__ = ["DATASETS", "Dataset", "from_arrays", "load", "validation_split"]
 
 # Ways to split each set into training and test rows, the default first.
 DATASETS: dict[str, tuple[str, ...]] = {

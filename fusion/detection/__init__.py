@@ -12,16 +12,12 @@ from fusion.detection.learning import (
     DetectorTrainConfig,
     fit_detector,
     make_example,
-    prepare_cache,
     run_detector,
-    to_objects,
 )
-from fusion.detection.network import Detections
 from fusion.detection.presets import preset
 from fusion.detection.sensors import camera_failure, lidar_failure
 
 __all__ = [
-    "Detections",
     "DetectorConfig",
     "DetectorParams",
     "DetectorTrainConfig",
@@ -30,9 +26,7 @@ __all__ = [
     "fit_detector",
     "lidar_failure",
     "make_example",
-    "prepare_cache",
     "preset",
     "read_frame",
     "run_detector",
-    "to_objects",
 ]

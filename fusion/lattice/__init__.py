@@ -3,7 +3,8 @@
 Every kind of layer is a module of functions: `init(key, config)`, `apply(config, params, x)`,
 `project(config, params)` and `check(config, params)`. Nothing here depends on the rest of
 `fusion`. The layers as flax modules are in `fusion.lattice.linen` and `fusion.lattice.nnx`.
-Pictures are in `fusion.lattice.plots`, which is imported on its own.
+Pictures are in `fusion.lattice.plots`, which is imported on its own; `premade`, `regularizers` and
+`quantiles` have what whole models are made of.
 """
 
 import importlib
@@ -16,26 +17,24 @@ from fusion.lattice import (
     lattice_layer,
     linear,
     linen,
-    premade,
     pwl,
-    regularizers,
 )
 from fusion.lattice.categorical import CategoricalConfig
 from fusion.lattice.deep_lattice import DeepLatticeConfig
-from fusion.lattice.ensemble import EnsembleConfig, random_features
+from fusion.lattice.ensemble import EnsembleConfig
 from fusion.lattice.estimators import LatticeClassifier, LatticeRegressor
 from fusion.lattice.lattice_config import LatticeConfig
-from fusion.lattice.lattice_layer import vertices
 from fusion.lattice.linear import LinearConfig
 from fusion.lattice.optimizer import with_projection
-from fusion.lattice.pwl import PWLConfig, keypoints
-from fusion.lattice.quantiles import quantile_keypoints
-from fusion.lattice.tagged import check_tree, project_tree, tag
+from fusion.lattice.premade import Feature
+from fusion.lattice.pwl import PWLConfig
+from fusion.lattice.tagged import check_tree, project_tree
 
 __all__ = [
     "CategoricalConfig",
     "DeepLatticeConfig",
     "EnsembleConfig",
+    "Feature",
     "LatticeClassifier",
     "LatticeConfig",
     "LatticeRegressor",
@@ -45,19 +44,12 @@ __all__ = [
     "check_tree",
     "deep_lattice",
     "ensemble",
-    "keypoints",
     "lattice_layer",
     "linear",
     "linen",
     "nnx",
-    "premade",
     "project_tree",
     "pwl",
-    "quantile_keypoints",
-    "random_features",
-    "regularizers",
-    "tag",
-    "vertices",
     "with_projection",
 ]
 

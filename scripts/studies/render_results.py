@@ -90,7 +90,7 @@ def draw_channel_weights(config: Config, path: Path) -> str | None:
     """Draw Figure 3.7 from the first seed of every model that has it; returns the channel."""
     import numpy as np
 
-    from fusion.data import HAR_CHANNELS
+    from fusion.data.har import HAR_CHANNELS
     from fusion.plots import plot_channel_weights
 
     models: dict[str, tuple[Any, Any]] = {}

@@ -53,7 +53,7 @@ def ceiling_of(dataset: Dataset, noise: Corruption) -> float | None:
     """Accuracy of the best classifier that is told which sensors failed; simulated sets only."""
     if dataset.name != "simulated" or noise.kind not in ("uniform", "gaussian"):
         return None
-    from fusion.data import SimulatedConfig, oracle_accuracy
+    from fusion.data.simulated import SimulatedConfig, oracle_accuracy
 
     return 100.0 * oracle_accuracy(SimulatedConfig(), noise.test)
 

@@ -109,7 +109,7 @@ def build_settings(config: Config, dataset: Dataset) -> Preset:
 def _protocols(config: Config, dataset: Dataset, name: ProtocolName) -> tuple[Any, Any, str]:
     """Protocol in training and in test, and the case in words."""
     from fusion import failures
-    from fusion.data import published_fixed
+    from fusion.data.fixed import published_fixed
 
     k = dataset.n_channels
     if name == "clean":

@@ -12,8 +12,15 @@ def make_data(folder: Path) -> None:
 
     import numpy as np
 
-    from fusion.data import DRIVER_CHANNELS, DRIVER_CLASSES, DRIVER_SOURCE_CHANNELS
-    from fusion.data.driver import N_ROWS, N_TRIPS, OIL, OIL_IN_FILE
+    from fusion.data.driver import (
+        DRIVER_CHANNELS,
+        DRIVER_CLASSES,
+        DRIVER_SOURCE_CHANNELS,
+        N_ROWS,
+        N_TRIPS,
+        OIL,
+        OIL_IN_FILE,
+    )
     from fusion.data.har import COUNTS, N_TIME
 
     rng = np.random.default_rng(0)

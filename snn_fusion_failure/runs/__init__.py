@@ -5,6 +5,7 @@ keep the same promises: nothing is overwritten silently, a file is either whole 
 of record carries the command, versions, device and seeds that made it.
 """
 
+# ruff: noqa: F401  (what the commands of this distribution share beyond the public names)
 from snn_fusion_failure.runs.changes import apply_changes
 from snn_fusion_failure.runs.command import WorkFailedError, run_command
 from snn_fusion_failure.runs.console import fail, print_result, progress
@@ -13,19 +14,4 @@ from snn_fusion_failure.runs.folder import open_run
 from snn_fusion_failure.runs.origin import command_line, provenance
 from snn_fusion_failure.runs.repository import enable_compilation_cache
 
-__all__ = [
-    "WorkFailedError",
-    "append_metrics",
-    "apply_changes",
-    "command_line",
-    "enable_compilation_cache",
-    "fail",
-    "open_run",
-    "print_result",
-    "progress",
-    "provenance",
-    "run_command",
-    "to_jsonable",
-    "write_json",
-    "write_text",
-]
+__all__ = ["WorkFailedError", "open_run", "run_command", "write_json"]

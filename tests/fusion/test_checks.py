@@ -17,9 +17,9 @@ import jax.numpy as jnp
 import pytest
 
 import fusion
-from fusion import failures, gating
+from fusion import failures, gating, models
 from fusion.config import HyperParams, ModelConfig, TrainConfig
-from fusion.data import check_dataset
+from fusion.data.dataset import check_dataset
 from fusion.loop import Corruption
 from fusion.losses import LossConfig, LossParams
 from fusion.targets import TargetConfig
@@ -79,7 +79,7 @@ WRONG: dict[str, Callable[[], Any]] = {
     ),
     "key=0: expected a typed": lambda: failures.draw_mask(CLEAN, 4, key=0),
     "rate=2.0": lambda: gating.drop_modalities(jnp.zeros((3, 2, 4)), 2.0, key=KEY),
-    "jax.random.key(seed)": lambda: fusion.init(jax.random.PRNGKey(0), ModelConfig()),
+    "jax.random.key(seed)": lambda: models.init(jax.random.PRNGKey(0), ModelConfig()),
     "preset='best': expected one of 'quick', 'paper'": lambda: fusion.preset(
         fusion.load("simulated"), name="best"
     ),

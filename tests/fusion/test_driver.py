@@ -10,18 +10,16 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.data import (
+from fusion.data import driver as module
+from fusion.data import load, validation_split
+from fusion.data.driver import (
     DRIVER_CHANNELS,
     DRIVER_CLASSES,
     DRIVER_REPLACEMENTS,
     DRIVER_SOURCE_CHANNELS,
-    fixed_sets,
-    load,
     load_driver,
-    published_fixed,
-    validation_split,
 )
-from fusion.data import driver as module
+from fusion.data.fixed import fixed_sets, published_fixed
 
 N_SECONDS = 12
 TRIPS = [*DRIVER_CLASSES, *DRIVER_CLASSES, *DRIVER_CLASSES, "B", "D"]

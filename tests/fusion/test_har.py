@@ -13,8 +13,10 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.data import HAR_CHANNELS, HAR_CLASSES, load, load_har, published_fixed, validation_split
 from fusion.data import har as module
+from fusion.data import load, validation_split
+from fusion.data.fixed import published_fixed
+from fusion.data.har import HAR_CHANNELS, HAR_CLASSES, load_har
 
 COUNTS = {"train": (3, 2, 2, 2, 2, 2), "test": (1, 1, 1, 1, 1, 2)}
 SUBJECTS = {"train": (1, 3, 5, 6), "test": (2, 4)}

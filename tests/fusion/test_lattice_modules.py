@@ -25,12 +25,11 @@ from fusion.lattice import (
     check_tree,
     linen,
     project_tree,
-    tag,
     with_projection,
 )
 from fusion.lattice import nnx as lattice_nnx
 from fusion.lattice.nnx import check_model
-from fusion.lattice.tagged import Tagged, layer_of
+from fusion.lattice.tagged import Tagged, layer_of, tag
 
 pytestmark = pytest.mark.relaxed  # flax and optax promote types
 

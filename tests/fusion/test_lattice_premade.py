@@ -9,16 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.lattice import (
-    LatticeClassifier,
-    LatticeRegressor,
-    estimators,
-    premade,
-    project_tree,
-    quantile_keypoints,
-    tag,
-)
+from fusion.lattice import LatticeClassifier, LatticeRegressor, estimators, premade, project_tree
 from fusion.lattice.premade import CalibratedConfig, Feature
+from fusion.lattice.quantiles import quantile_keypoints
+from fusion.lattice.tagged import tag
 
 pytestmark = pytest.mark.relaxed  # optax promotes types
 FEATURES = (

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from fusion.data import check_dataset, from_arrays
+from fusion.data import from_arrays
+from fusion.data.dataset import check_dataset
 
 RNG = np.random.default_rng(0)
 X = RNG.normal(size=(40, 3, 8)) * np.array([1.0, 1e3, 1e-3])[None, :, None]

@@ -11,19 +11,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from scipy import integrate, stats
 
-from fusion.data import (
-    SimulatedConfig,
-    apply_scale,
-    bayes_accuracy,
-    check_dataset,
-    draw_groups,
-    fit_scale,
-    load_simulated,
-    oracle_accuracy,
-    published_fixed,
-    validation_split,
-)
-from fusion.data.dataset import Dataset
+from fusion.data import validation_split
+from fusion.data.dataset import Dataset, apply_scale, check_dataset, draw_groups, fit_scale
+from fusion.data.fixed import published_fixed
+from fusion.data.simulated import SimulatedConfig, bayes_accuracy, load_simulated, oracle_accuracy
 from fusion.failures import fixed_failing, generalisation, no_failure, random_failing
 
 CONFIG = SimulatedConfig(n_train=64, n_test=20_000)

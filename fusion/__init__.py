@@ -5,8 +5,8 @@
 - Training: `preset`, `fit`, `make_train`, `test_output`, `split_accuracy`.
 
 The modules build on each other in this order: `lattice` (usable alone), `encoders`, `gating`,
-`losses`, `targets`, `models`, `failures`, `train`, `evaluate`, `data`, `loop`, `presets`, `monitor`,
-`fitted`; `modules` (flax), `estimator` (scikit-learn) and `plots` stand beside them.
+`losses`, `targets`, `models`, `failures`, `train`, `evaluate`, `data`, `loop`, `presets`,
+`monitor`, `fitted`; `modules` (flax), `estimator` (scikit-learn) and `plots` stand beside them.
 """
 
 from fusion.config import HyperParams, ModelConfig, TrainConfig

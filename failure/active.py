@@ -12,8 +12,6 @@ from jaxtyping import Array, Float
 from failure import revnet
 from failure.rev_argate import RevArgateConfig, RevArgateParams, active_features, fusion_weights
 
-__all__ = ["Activity", "activity", "by_transistor"]
-
 
 class Activity(NamedTuple):
     """Result of `activity`.

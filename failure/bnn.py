@@ -11,21 +11,6 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Int, Key
 
-__all__ = [
-    "BNNConfig",
-    "BNNParams",
-    "BNNTrainParams",
-    "LinearPosterior",
-    "fit",
-    "fit_linear",
-    "init",
-    "negative_elbo",
-    "predict",
-    "predict_linear",
-    "sample",
-    "sample_linear",
-]
-
 
 @dataclass(frozen=True)
 class BNNConfig:

@@ -7,16 +7,6 @@ from typing import NamedTuple
 
 import numpy as np
 
-__all__ = [
-    "GOOD",
-    "Estimate",
-    "check_threshold",
-    "clopper_pearson",
-    "combine",
-    "log_normal_interval",
-    "mean_of_terms",
-]
-
 GOOD = "good"
 """The verdict of an estimate that passed all its checks."""
 

@@ -12,8 +12,6 @@ from jaxtyping import Array, Float, Key
 from failure.worst_case import Archive, Region, merge_regions, worst_case_points
 from failure.yields import normal_draws
 
-__all__ = ["centre_of_failures", "explore"]
-
 _PER_SPEC = 3
 """Regions of one specification at most."""
 

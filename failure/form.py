@@ -13,8 +13,6 @@ from jaxtyping import Float
 from failure.estimates import check_threshold
 from failure.performances import Performance
 
-__all__ = ["design_points", "merge_points"]
-
 
 def merge_points(
     points: np.ndarray, *, cosine: float = 0.9, excess: float = 2.5, most: int = 8

@@ -11,8 +11,6 @@ from jaxtyping import Float
 from failure.estimates import GOOD, check_threshold
 from failure.performances import Counted, Performance, Slopes
 
-__all__ = ["COSINE", "GAP", "DesignPoint", "find_design_point"]
-
 COSINE = 0.99
 """A point is a design point when its direction and the gradient there agree this well."""
 

@@ -13,8 +13,6 @@ from failure.estimates import GOOD, Estimate, check_threshold, mean_of_terms
 from failure.hlrf import DesignPoint
 from failure.performances import Counted, Performance, Slopes
 
-__all__ = ["Lines", "line_sampling", "sample_lines"]
-
 STEP = 1.5
 """Longest step along a line from one evaluation to the next [sigma]."""
 

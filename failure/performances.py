@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["Counted", "Performance", "Slopes", "slopes_by_jax", "traceable"]
-
 # x [n, D] -> y [n]
 Performance = Callable[[Any], Any]
 # x [n, D] -> (y [n], dy/dx [n, D])

@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 
 from failure.search.bayesopt import best_so_far
 
-__all__ = ["plot_activity", "plot_shares", "plot_trend"]
-
 
 def plot_trend(
     outputs: Mapping[str, np.ndarray],

@@ -16,8 +16,6 @@ from jaxtyping import Float
 
 from failure.performances import Performance
 
-__all__ = ["PROBLEMS", "Problem", "make_problem"]
-
 
 class Problem(NamedTuple):
     """A performance function with its exact answer.

@@ -14,8 +14,6 @@ from failure.hlrf import DesignPoint, find_design_point
 from failure.lines import BEND, sample_lines
 from failure.performances import Counted, Performance, Slopes
 
-__all__ = ["Regions", "probability_by_lines"]
-
 ALIKE = 0.9
 """Design points with a larger cosine stand for one region."""
 

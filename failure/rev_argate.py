@@ -17,19 +17,6 @@ from fusion.gating import Gate, apply_weights
 from fusion.losses import LossParams, loss_targets
 from fusion.targets import TargetConfig, apply_targets, init_targets, project_targets
 
-__all__ = [
-    "RevArgateConfig",
-    "RevArgateParams",
-    "RevArgateTrainParams",
-    "active_features",
-    "check_active",
-    "fit",
-    "fusion_weights",
-    "init",
-    "loss",
-    "predict",
-]
-
 
 @dataclass(frozen=True)
 class RevArgateConfig:

@@ -20,8 +20,6 @@ from failure.rev_argate import (
 from failure.search.spaces import ReversedFeatures
 from failure.search.task import Task, unit_scale
 
-__all__ = ["make_space", "train_space"]
-
 
 def make_space(
     config: RevArgateConfig,

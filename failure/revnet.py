@@ -8,8 +8,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
-__all__ = ["RevNetParams", "forward", "forward_stored", "init", "inverse"]
-
 
 class RevNetParams(NamedTuple):
     """Weights of `depth` blocks, stacked on the leading axis; `m = ceil(D / 2)`.

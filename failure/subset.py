@@ -21,8 +21,6 @@ from failure.estimates import (
 )
 from failure.performances import Performance, traceable
 
-__all__ = ["subset_simulation"]
-
 LEAST_SEEDS = 10
 """Fewer samples than this above a rung cannot carry its chains."""
 

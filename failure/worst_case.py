@@ -13,15 +13,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = [
-    "Archive",
-    "BudgetSpentError",
-    "Region",
-    "find_regions",
-    "slopes_at",
-    "worst_case_points",
-]
-
 Evaluate = Callable[[np.ndarray], np.ndarray]
 """`x [n, d] -> g [n, k]`: violations, above 0 where a specification fails, NaN where unknown."""
 

@@ -15,8 +15,6 @@ from failure.exploration import explore
 from failure.worst_case import Archive, Region, find_regions
 from failure.yields import Mixture, SpecYield, interval, line_sampling, mixture_sampling
 
-__all__ = ["Analysis", "AnalysisConfig", "SpecAnalysis", "analyse"]
-
 
 @dataclass(frozen=True)
 class AnalysisConfig:

@@ -17,8 +17,6 @@ from jaxtyping import Array, Float, Key
 
 from failure.worst_case import Archive, Region
 
-__all__ = ["Mixture", "SpecYield", "interval", "line_sampling", "mixture_sampling", "normal_draws"]
-
 
 class SpecYield(NamedTuple):
     """A failure probability with a 95 % interval, or what is known in its place.

@@ -13,8 +13,6 @@ from typing import Any, get_type_hints
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = ["build", "flatten", "read_arrays", "unflatten", "write_arrays"]
-
 
 def write_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write an `.npz`; a reader sees the old file or the new one."""

@@ -13,8 +13,6 @@ import numpy as np
 if TYPE_CHECKING:
     from fusion.train import TrainState
 
-__all__ = ["Checkpoints", "settings_of"]
-
 History = list[dict[str, float]]
 
 

@@ -14,8 +14,6 @@ from typing import Any
 import jax
 import numpy as np
 
-__all__ = ["check_choice", "check_count", "check_counts", "check_key", "check_number", "check_type"]
-
 
 def check_choice(name: str, value: Any, options: Iterable[Any]) -> None:
     """`value` is one of `options`; the message lists them and names the nearest."""

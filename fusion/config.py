@@ -14,8 +14,6 @@ from fusion.gating import Fusion, Normalizer, Scaling
 from fusion.losses import LossConfig, LossParams
 from fusion.targets import TargetConfig
 
-__all__ = ["MODELS", "HyperParams", "ModelConfig", "Recipe", "TrainConfig"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Recipe:

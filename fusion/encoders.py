@@ -19,16 +19,6 @@ from jaxtyping import Array, Float
 
 from fusion._checks import check_choice, check_count, check_counts
 
-__all__ = [
-    "EncoderConfig",
-    "ScalarEncoder",
-    "SeriesEncoder",
-    "conv1d",
-    "encoder",
-    "reading_levels",
-    "stacked_dense",
-]
-
 Backend = Literal["matmul", "conv"]
 
 

@@ -24,8 +24,6 @@ except ImportError as error:
         "fusion.estimator needs scikit-learn: pip install 'snn-fusion-failure[sklearn]'"
     ) from error
 
-__all__ = ["ARGateClassifier"]
-
 
 def _recur(x: Float[np.ndarray, "n k 1"]) -> bool:
     """Whether every sensor gives few distinct readings, each about eight times or more."""

@@ -15,19 +15,6 @@ from jaxtyping import Bool, Float, Int, Num
 
 from fusion._checks import check_choice
 
-__all__ = [
-    "AccuracySplit",
-    "accuracy",
-    "auroc",
-    "confusion_matrix",
-    "gap_closure",
-    "gate_auroc",
-    "mean_retained_accuracy",
-    "mean_weights",
-    "retained_accuracy",
-    "split_accuracy",
-]
-
 GateAmong = Literal["pooled", "example", "channel"]
 
 

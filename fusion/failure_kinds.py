@@ -11,8 +11,6 @@ from jaxtyping import Array, Bool, Float, Key
 
 from fusion._checks import check_choice, check_key, check_number
 
-__all__ = ["FAILURE_KINDS", "FailureKind", "apply_failure"]
-
 FailureKind = Literal["uniform", "gaussian", "zero", "stuck", "drift", "dropout", "gain", "clip"]
 FAILURE_KINDS: tuple[FailureKind, ...] = get_args(FailureKind)
 

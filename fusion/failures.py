@@ -19,16 +19,6 @@ from jaxtyping import Array, Bool, Float, Key
 from fusion._checks import check_choice, check_count, check_key, check_number
 from fusion.failure_kinds import FAILURE_KINDS, FailureKind, apply_failure
 
-__all__ = [
-    "Protocol",
-    "corrupt",
-    "draw_mask",
-    "fixed_failing",
-    "generalisation",
-    "no_failure",
-    "random_failing",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class Protocol:

@@ -22,8 +22,6 @@ from fusion.models import Params, check_windows, export, predict
 from fusion.monitor import MonitorParams, failure_probability, fit_monitor
 from fusion.train import TrainState
 
-__all__ = ["FittedARGate", "Prediction", "finish"]
-
 FORMAT = 1
 """Version of the file that `FittedARGate.save` writes."""
 FAR = 0.5

@@ -15,19 +15,6 @@ from jaxtyping import Array, Bool, Float, Key
 
 from fusion._checks import check_choice, check_key, check_number
 
-__all__ = [
-    "Fusion",
-    "Gate",
-    "Normalizer",
-    "Scaling",
-    "apply_weights",
-    "available_weights",
-    "drop_modalities",
-    "embrace",
-    "normalize",
-    "oracle_weights",
-]
-
 Normalizer = Literal["softmax", "softmax_sigmoid"]
 Fusion = Literal["concat", "sum"]
 Scaling = Literal["mean", "max"]

@@ -26,8 +26,6 @@ from fusion.failures import Protocol, corrupt
 from fusion.models import export
 from fusion.train import TrainState, init_state, make_epoch, predict_batches
 
-__all__ = ["Corruption", "FitResult", "TestOutput", "TrainingDiverged", "fit", "test_output"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Corruption:

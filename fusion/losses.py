@@ -13,17 +13,6 @@ from jaxtyping import Array, Float, Int
 from fusion._checks import check_choice, check_number
 from fusion.gating import Normalizer, normalize
 
-__all__ = [
-    "GatePenalty",
-    "LossConfig",
-    "LossParams",
-    "LossTerms",
-    "argate_loss",
-    "cross_entropy",
-    "gate_penalty",
-    "loss_targets",
-]
-
 
 class _LossParams(NamedTuple):
     alpha: float | Array = 1.0

@@ -30,19 +30,6 @@ from fusion.gating import (
 )
 from fusion.targets import init_targets
 
-__all__ = [
-    "AuxiliaryPaths",
-    "FusionNet",
-    "MainOutput",
-    "auxiliary_logits",
-    "check_windows",
-    "count_parameters",
-    "export",
-    "init",
-    "match_parameters",
-    "predict",
-]
-
 Params = dict[str, Any]
 
 

@@ -19,8 +19,6 @@ from fusion.gating import Fusion, Gate, Normalizer, Scaling, apply_weights, avai
 from fusion.losses import LossConfig, LossParams, LossTerms, cross_entropy, gate_penalty
 from fusion.targets import TargetConfig, apply_targets, init_targets, project_targets
 
-__all__ = ["ARGate", "ARGateLoss", "ARGateOutput", "LatticeTargets", "project_argate"]
-
 
 class ARGateOutput(NamedTuple):
     """What a fusion network gives.

@@ -20,8 +20,6 @@ from fusion.config import ModelConfig
 from fusion.failure_kinds import FAILURE_KINDS, FailureKind, apply_failure
 from fusion.models import Params, predict
 
-__all__ = ["MonitorParams", "failure_probability", "fit_monitor"]
-
 STEPS = 300
 RIDGE = 1e-3
 

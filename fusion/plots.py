@@ -12,8 +12,6 @@ from matplotlib.figure import Figure
 
 from fusion._checks import check_choice
 
-__all__ = ["plot_cases", "plot_channel_weights", "plot_confusion", "plot_gate", "plot_training"]
-
 Values = ArrayLike | Sequence[Any]
 
 CLEAN = "#0072b2"

@@ -12,8 +12,6 @@ from fusion.encoders import EncoderConfig, reading_levels
 from fusion.losses import LossParams
 from fusion.models import match_parameters
 
-__all__ = ["PRESETS", "Preset", "preset"]
-
 
 class Preset(NamedTuple):
     """A network and how it is trained."""

@@ -14,15 +14,6 @@ from fusion.lattice import deep_lattice
 from fusion.lattice.checks import refusal, require_count, require_range
 from fusion.lattice.deep_lattice import DeepLatticeConfig, DeepLatticeParams
 
-__all__ = [
-    "TargetConfig",
-    "apply_targets",
-    "check_targets",
-    "init_targets",
-    "lattice_config",
-    "project_targets",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class TargetConfig:

@@ -22,17 +22,6 @@ from fusion.losses import LossTerms, argate_loss, cross_entropy
 from fusion.models import MainOutput, Params, auxiliary_logits, init, predict
 from fusion.targets import apply_targets, project_targets
 
-__all__ = [
-    "EpochMetrics",
-    "TrainState",
-    "batch_loss",
-    "init_state",
-    "make_epoch",
-    "make_train",
-    "predict_batches",
-    "train_step",
-]
-
 
 class TrainState(NamedTuple):
     """What a step changes."""

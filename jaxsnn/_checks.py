@@ -13,18 +13,6 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-__all__ = [
-    "concrete",
-    "default_float",
-    "require",
-    "require_choice",
-    "require_finite",
-    "require_key",
-    "require_keys",
-    "require_positive",
-    "require_whole",
-]
-
 
 def default_float() -> Any:
     """The dtype that states are made in: float32, or float64 under `jax.enable_x64`."""

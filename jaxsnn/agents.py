@@ -21,8 +21,6 @@ from jaxsnn.rewards import motor_rewards, scale_by_remaining_turn, terminal_rewa
 from jaxsnn.window import STDPKernel
 from jaxsnn.world import Outcome, Reading
 
-__all__ = ["Agent", "SNNMemory", "SNNParams", "snn_agent", "snn_params", "steering_angle"]
-
 
 class Agent(NamedTuple):
     """What `trials.py` needs of an agent; `P`, `S` and `M` are pytrees of the agent's own.

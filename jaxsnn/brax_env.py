@@ -24,8 +24,6 @@ from jaxtyping import Array
 
 from jaxsnn import navigation, world
 
-__all__ = ["FreshResetWrapper", "NavigationEnv", "brax_compatibility", "wrap_for_training"]
-
 
 class PipelineState(NamedTuple):
     """What a robot carries: its pose, and a key for its sensors' noise as raw words.

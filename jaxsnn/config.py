@@ -23,18 +23,6 @@ from jaxsnn.neurons import LIFParams, check_lif
 from jaxsnn.plasticity import Bounds, Rule, STDPParams, check_stdp
 from jaxsnn.rewards import RewardParams, check_rewards, reward_params
 
-__all__ = [
-    "NETWORKS",
-    "NetworkConfig",
-    "NetworkParams",
-    "Weights",
-    "check_network",
-    "network_config",
-    "network_params",
-    "neuron_signs",
-    "weight_bounds",
-]
-
 
 @dataclasses.dataclass(frozen=True)
 class NetworkConfig:

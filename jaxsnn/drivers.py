@@ -18,8 +18,6 @@ from jaxsnn import world
 from jaxsnn.agents import Agent
 from jaxsnn.trials import TrialResult, run_phase
 
-__all__ = ["DRIVERS", "DriverParams", "drive", "driver_agent", "driver_steering"]
-
 
 class DriverParams(NamedTuple):
     """Constants of a driver; may be traced.

@@ -22,16 +22,6 @@ from jaxsnn._checks import (
 )
 from jaxsnn.sensor_intervals import angle_region, distance_interval, sonar_interval
 
-__all__ = [
-    "ANGLE_CODES",
-    "N_GROUPS",
-    "RateTable",
-    "check_rates",
-    "group_rates",
-    "poisson_spikes",
-    "rate_table",
-]
-
 N_GROUPS = 7
 
 AngleCode = Literal["region", "listed", "ring"]

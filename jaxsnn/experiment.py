@@ -20,17 +20,6 @@ from jaxsnn.agents import SNNParams, snn_agent, snn_params
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights
 from jaxsnn.trials import TrialResult, check_circles, run_phase, start_states
 
-__all__ = [
-    "TEST_TRIALS",
-    "Experiment",
-    "learning_circles",
-    "make_runner",
-    "phase_keys",
-    "run_experiment",
-    "seed_keys",
-    "shortest_paths",
-]
-
 TEST_TRIALS = {1: 30, 2: 20, 3: 20}
 """Testing trials of each scenario in the source (section 2.5)."""
 

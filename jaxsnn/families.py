@@ -24,8 +24,6 @@ from jaxsnn.shapes import Corners, cup, regular
 from jaxsnn.trials import success_rate
 from jaxsnn.world import WorldParams
 
-__all__ = ["FAMILIES", "SPLITS", "Difficulty", "difficulty", "family_map", "is_admitted"]
-
 SPLITS = {"train": 0, "validation": 1_000_000, "test": 2_000_000}
 """First seed of each split; a million seeds each, so that none is ever in two of them."""
 ROOM = 15.0

@@ -14,19 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = [
-    "check_polygon",
-    "disc_box_contact",
-    "disc_circle_contact",
-    "disc_segment_contact",
-    "inside_polygon",
-    "polygon_segments",
-    "ray_box",
-    "ray_circles",
-    "ray_segments",
-    "segment_distance",
-]
-
 Polygon = Sequence[Sequence[int | float]] | np.ndarray
 
 

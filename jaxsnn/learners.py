@@ -16,8 +16,6 @@ from jaxtyping import Array, Key
 
 from jaxsnn import navigation, planner, ppo, qlearning, world
 
-__all__ = ["CHECKPOINTS", "learner_keys", "train_ppo", "train_qlearning"]
-
 # Greedy tests of the Q-learner after so many training trials, each a multiple of the chunk before
 # it.
 CHECKPOINTS = (20, 40, 60, 80, 100, 200, 300, 500, 1000, 2000)

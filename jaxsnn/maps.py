@@ -21,8 +21,6 @@ from jaxsnn._checks import require_key
 from jaxsnn.planner import Obstacles, path_field
 from jaxsnn.world import N_SONARS, WorldParams
 
-__all__ = ["make_map", "random_map", "stack_maps"]
-
 Number = int | float
 Point = Sequence[Number]
 Polygon = Sequence[Point] | np.ndarray

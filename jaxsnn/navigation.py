@@ -14,17 +14,6 @@ from jaxsnn import world
 from jaxsnn._checks import require_whole
 from jaxsnn.ppo import Env, Transition
 
-__all__ = [
-    "OBSERVATION_SIZE",
-    "STEERING_SCALE",
-    "Drive",
-    "drive_robot",
-    "navigation_env",
-    "navigation_reward",
-    "observation",
-    "start_robot",
-]
-
 OBSERVATION_SIZE = world.N_SONARS + 3
 # A full action turns the robot by this much [deg].
 STEERING_SCALE = 45.0

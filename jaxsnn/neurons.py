@@ -21,8 +21,6 @@ from jaxsnn._checks import (
     require_whole,
 )
 
-__all__ = ["LIFParams", "LIFState", "check_lif", "lif_init", "lif_scan", "lif_step"]
-
 
 class LIFParams(NamedTuple):
     """Constants of a layer of neurons; leaves are scalars or broadcast against the layer.

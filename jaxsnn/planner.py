@@ -15,8 +15,6 @@ import numpy as np
 from jaxsnn import geometry
 from jaxsnn.world import WorldParams
 
-__all__ = ["Obstacles", "PathField", "check_pose", "path_field", "shortest_path"]
-
 Point = Sequence[int | float] | np.ndarray
 
 # Kept between a planned path and the exact reach of an obstacle, so that rounding cannot block it

@@ -24,19 +24,6 @@ from jaxsnn._checks import (
     require_whole,
 )
 
-__all__ = [
-    "STDPParams",
-    "STDPState",
-    "Traces",
-    "apply_reward",
-    "check_bounds",
-    "check_stdp",
-    "rm_stdp_curve",
-    "stdp_curve",
-    "stdp_init",
-    "stdp_step",
-]
-
 Rule = Literal["additive", "multiplicative"]
 Bounds = Literal["hard", "soft"]
 

@@ -19,16 +19,6 @@ from matplotlib.patches import Circle, Polygon, Rectangle, Wedge
 
 from jaxsnn import planner, world
 
-__all__ = [
-    "plot_learning_curves",
-    "plot_maps",
-    "plot_rm_stdp_curves",
-    "plot_spike_raster",
-    "plot_stdp_curve",
-    "plot_trajectories",
-    "plot_trial",
-]
-
 # Colour-blind safe (Okabe & Ito); black comes last.
 COLOURS = ("#0072B2", "#D55E00", "#009E73", "#CC79A7", "#E69F00", "#56B4E9", "#000000")
 _OBSTACLE = "#8c8c8c"

@@ -33,21 +33,6 @@ from jaxsnn._checks import (
     require_whole,
 )
 
-__all__ = [
-    "ActorCritic",
-    "Env",
-    "PPOConfig",
-    "PPOParams",
-    "Result",
-    "Rollout",
-    "Transition",
-    "act",
-    "check_ppo",
-    "evaluate",
-    "gae",
-    "make_train",
-]
-
 
 class Transition(NamedTuple):
     """What an environment answers to an action."""

@@ -19,8 +19,6 @@ from jaxsnn.config import (
 )
 from jaxsnn.plasticity import STDPParams
 
-__all__ = ["READINGS", "preset"]
-
 # Per reading: changes of NetworkConfig, of NetworkParams, of STDPParams and of RewardParams.
 READINGS: dict[str, dict[str, dict[str, Any]]] = {
     "literal": {

@@ -23,18 +23,6 @@ from jaxsnn._checks import (
     require_whole,
 )
 
-__all__ = [
-    "ACTIONS",
-    "N_STATES",
-    "QParams",
-    "Trials",
-    "check_q",
-    "discretize",
-    "init",
-    "run_trials",
-    "td_target",
-]
-
 ACTIONS = (0.0, 30.0, -30.0)  # steering of forward, left, right [deg]
 N_STATES = (
     sensor_intervals.N_SONAR**world.N_SONARS

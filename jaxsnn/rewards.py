@@ -14,18 +14,6 @@ from jaxtyping import Array, Bool, Float
 from jaxsnn._checks import concrete, require, require_choice, require_finite, require_positive
 from jaxsnn.sensor_intervals import angle_region
 
-__all__ = [
-    "RewardParams",
-    "avoidance_rewards",
-    "check_rewards",
-    "motor_rewards",
-    "reward_params",
-    "scale_by_remaining_turn",
-    "synapse_signs",
-    "target_reward",
-    "terminal_reward",
-]
-
 
 class RewardParams(NamedTuple):
     """Constants of section 2.2.2.

@@ -19,8 +19,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["Baseline", "baseline_init", "baseline_update"]
-
 
 class Baseline(NamedTuple):
     """Mean spikes per step of each presynaptic neuron, and the time it was taken over [s]."""

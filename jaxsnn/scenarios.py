@@ -19,8 +19,6 @@ from jaxsnn.maps import make_map
 from jaxsnn.shapes import box, mirrored, regular
 from jaxsnn.world import WorldParams
 
-__all__ = ["MAX_STEPS", "NAMES", "detour", "scenario"]
-
 NAMES = {1: "Scenario 1", 2: "Scenario 2", 3: "Scenario 3"}
 # A trial that has not ended after this many control steps has failed; about three times what the
 # source's slowest network needs (N_mv = 75).

@@ -10,8 +10,6 @@ import numpy as np
 from jaxsnn.experiment import Experiment
 from jaxsnn.status import Status
 
-__all__ = ["mean_of_arrivals", "path_ratios", "per_seed", "score", "success"]
-
 
 def per_seed(experiment: Experiment, seeds: Sequence[int]) -> list[dict[str, Any]]:
     """One JSON record per seed: status, steps and path of every trial, and mean firing rates."""

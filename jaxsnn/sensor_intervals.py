@@ -14,15 +14,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-__all__ = [
-    "N_ANGLE",
-    "N_DISTANCE",
-    "N_SONAR",
-    "angle_region",
-    "distance_interval",
-    "sonar_interval",
-]
-
 N_SONAR, N_DISTANCE, N_ANGLE = 3, 4, 4
 _SONAR_STEP = 100.0  # [px]
 _DISTANCE_STEP = 200.0  # [px]

@@ -6,8 +6,6 @@ import math
 
 import numpy as np
 
-__all__ = ["box", "cup", "mirrored", "regular"]
-
 Number = int | float
 Corners = list[tuple[Number, Number]]
 

@@ -20,15 +20,6 @@ from jaxsnn._checks import concrete, default_float, require, require_keys, requi
 from jaxsnn.agents import Agent
 from jaxsnn.status import Status
 
-__all__ = [
-    "TrialResult",
-    "check_circles",
-    "run_phase",
-    "run_trial",
-    "start_states",
-    "success_rate",
-]
-
 
 class TrialResult(NamedTuple):
     """How trials ended; leaves lead with robots, then trials.

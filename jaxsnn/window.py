@@ -23,8 +23,6 @@ from jaxtyping import Array, Float
 from jaxsnn._checks import default_float, require, require_whole
 from jaxsnn.plasticity import STDPParams, STDPState, Traces, check_stdp, stdp_step
 
-__all__ = ["STDPKernel", "stdp_kernel", "stdp_steps", "stdp_window"]
-
 
 class STDPKernel(NamedTuple):
     """What `stdp_window` needs to know about `STDPParams` and the number of steps.

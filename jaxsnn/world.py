@@ -29,21 +29,6 @@ from jaxtyping import Array, Bool, Float, Int, Key
 from jaxsnn import geometry
 from jaxsnn._checks import require_key
 
-__all__ = [
-    "N_SONARS",
-    "Discs",
-    "Outcome",
-    "Reading",
-    "WorldParams",
-    "WorldState",
-    "observe",
-    "observe_many",
-    "obstacles_at",
-    "reset",
-    "step",
-    "step_many",
-]
-
 N_SONARS = 5
 
 

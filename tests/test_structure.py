@@ -23,6 +23,13 @@ BELOW = {
     "scripts": PACKAGES,
 }
 """Room -> the rooms that it may import from."""
+RE_EXPORT = {
+    "jaxsnn.network",
+    "fusion.detection.kitti.files",
+    "failure.rare_events",
+    "failure.search.bayesopt",
+}
+"""Modules that gather names of their neighbours under one roof."""
 ONE_ARROW = {("failure.rev_argate", "fusion")}
 SAME_MEANING = {
     "_checks": "refusals of what a user gives",
@@ -174,6 +181,25 @@ def test_no_package_hides_one_of_its_modules() -> None:
                     if bound in GRAPH.files and bound != f"{node.module}.{alias.name}":
                         hidden.append(bound)
     assert hidden == []
+
+
+def lists_names(path: Path) -> bool:
+    """Does a file assign `__all__`."""
+    return any(
+        isinstance(target, ast.Name) and target.id == "__all__"
+        for node in ast.parse(path.read_text(encoding="utf-8")).body
+        if isinstance(node, ast.Assign)
+        for target in node.targets
+    )
+
+
+def test_only_packages_list_their_names() -> None:
+    """A module's names are those without a leading underscore; a second list would only age."""
+    found = {m for m, p in GRAPH.files.items() if p.name != "__init__.py" and lists_names(p)}
+    assert found - RE_EXPORT == set(), (
+        "remove `__all__`; use a leading underscore for what is private"
+    )
+    assert RE_EXPORT - found == set()
 
 
 @pytest.mark.parametrize("package", api.PACKAGES)

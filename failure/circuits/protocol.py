@@ -14,8 +14,6 @@ from jaxtyping import Array, Float, Int
 
 from failure.status import Status
 
-__all__ = ["CHUNK", "Circuit", "Spec", "in_chunks"]
-
 CHUNK = 64
 """Samples that are solved side by side; a batch this wide keeps the solver in the cache."""
 

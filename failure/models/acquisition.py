@@ -15,19 +15,6 @@ from jaxtyping import Array, Float, Key
 from failure.models import gp
 from failure.models.optimize import Domain, bfgs, polish, project, sample
 
-__all__ = [
-    "ACQUISITIONS",
-    "AcquisitionConfig",
-    "acquisition_value",
-    "confidence_bound",
-    "log_ei",
-    "log_h",
-    "pbo_weights",
-    "propose",
-    "raw_points",
-    "weighted",
-]
-
 ACQUISITIONS = ("log_ei", "lcb", "pbo")
 
 _HALF_LOG_2PI = 0.5 * math.log(2.0 * math.pi)

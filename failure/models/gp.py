@@ -15,7 +15,6 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 from failure.models.kernels import (
-    KERNELS,
     GPConfig,
     GPParams,
     kernel_diagonal,
@@ -25,19 +24,6 @@ from failure.models.kernels import (
     row_mask,
 )
 from failure.models.triangular import inverse_factor
-
-__all__ = [
-    "KERNELS",
-    "GPConfig",
-    "GPParams",
-    "Posterior",
-    "append",
-    "condition",
-    "kernel_matrix",
-    "padded_size",
-    "predict",
-    "standardize",
-]
 
 # A search pads its data to the next of these sizes.
 SIZES = (64, 96, 128, 160, 192, 224, 256, 288, 320)

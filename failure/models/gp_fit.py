@@ -22,16 +22,6 @@ from failure.models.kernels import (
 from failure.models.optimize import bfgs, box
 from failure.models.triangular import gram_of_lower, inverse_factor
 
-__all__ = [
-    "FitResult",
-    "fit",
-    "initial_params",
-    "log_marginal_likelihood",
-    "log_prior",
-    "map_objective",
-    "map_value_and_grad",
-]
-
 _LOG_2PI = math.log(2.0 * math.pi)
 
 

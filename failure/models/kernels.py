@@ -9,19 +9,6 @@ from typing import NamedTuple
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = [
-    "KERNELS",
-    "GPConfig",
-    "GPParams",
-    "kernel_diagonal",
-    "kernel_matrix",
-    "noise_variance",
-    "noisy_covariance",
-    "profile",
-    "row_mask",
-    "squared_distance",
-]
-
 KERNELS = ("matern52", "rbf", "linear")
 
 

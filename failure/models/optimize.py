@@ -9,8 +9,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int, Key
 
-__all__ = ["BFGSResult", "Domain", "ball", "bfgs", "box", "polish", "project", "sample"]
-
 
 class Domain(NamedTuple):
     """The set `lower <= x <= upper`, `|x| <= radius` (infinite bounds switch a part off)."""

@@ -6,8 +6,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-__all__ = ["gram_of_lower", "inverse_factor", "invert_lower"]
-
 
 def invert_lower(factor: Array) -> Array:
     """Inverse of a lower triangle, by halves: what is known to be zero is not multiplied."""

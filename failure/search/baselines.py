@@ -11,8 +11,6 @@ import numpy as np
 
 from failure.search.task import Task
 
-__all__ = ["gradient_corner", "monte_carlo", "ridge", "ridge_corner", "uniform", "worst_corner"]
-
 
 def uniform(rng: np.random.Generator, task: Task, n: int) -> np.ndarray:
     """`n` uniform points of the task's set, `[n, D]`."""

@@ -20,9 +20,6 @@ from failure.models import acquisition, gp, gp_fit
 from failure.models.optimize import Domain
 from failure.search import baselines, turbo
 from failure.search.history import (
-    METHODS,
-    Method,
-    SearchConfig,
     SearchState,
     Surrogate,
     TrainSpace,
@@ -30,6 +27,7 @@ from failure.search.history import (
     first_hit,
     init,
 )
+from failure.search.methods import METHODS, Method, SearchConfig
 from failure.search.spaces import FullSpace, initial_design, random_embedding
 from failure.search.subspace import train_subspace
 from failure.search.task import task_domain, unit_scale

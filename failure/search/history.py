@@ -7,19 +7,7 @@ from typing import Any, NamedTuple
 
 import numpy as np
 
-from failure.search.methods import METHODS, Method, SearchConfig
-
-__all__ = [
-    "METHODS",
-    "Method",
-    "SearchConfig",
-    "SearchState",
-    "Surrogate",
-    "TrainSpace",
-    "best_so_far",
-    "first_hit",
-    "init",
-]
+from failure.search.methods import SearchConfig
 
 
 class Surrogate(NamedTuple):

@@ -10,8 +10,6 @@ from failure.models.kernels import GPConfig
 from failure.search.task import Task
 from failure.search.turbo import TurboConfig
 
-__all__ = ["METHODS", "Method", "SearchConfig"]
-
 
 @dataclass(frozen=True)
 class Method:

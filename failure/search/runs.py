@@ -13,11 +13,9 @@ import numpy as np
 from failure.models.gp import GPParams
 from failure.search import bayesopt, storage
 from failure.search.bayesopt import SearchConfig, SearchState, Surrogate
-from failure.search.storage import identity_of, samples
+from failure.search.storage import identity_of
 from failure.search.task import sign_of
 from failure.status import Status
-
-__all__ = ["Evaluated", "evaluate", "identity_of", "load", "run", "samples", "start_from"]
 
 # x [n, D] -> (specs [n, m], status [n]); 0 is a valid sample
 Simulate = Callable[[np.ndarray], tuple[Any, Any]]

@@ -16,8 +16,6 @@ import numpy as np
 from failure.search.runs import Simulate
 from failure.search.storage import identity_of
 
-__all__ = ["side_by_side"]
-
 T = TypeVar("T")
 
 

@@ -20,21 +20,7 @@ from jaxtyping import Array, Float, Key
 
 from failure import bnn, revnet
 from failure.models.optimize import Domain, ball, box, project, sample
-from failure.search.task import Task, task_domain, unit_scale
-
-__all__ = [
-    "SPACES",
-    "ActiveSubspace",
-    "FullSpace",
-    "RandomEmbedding",
-    "ReversedFeatures",
-    "SearchSpace",
-    "Task",
-    "initial_design",
-    "random_embedding",
-    "task_domain",
-    "unit_scale",
-]
+from failure.search.task import Task, unit_scale
 
 
 @runtime_checkable

@@ -23,18 +23,6 @@ import numpy as np
 from failure.search.history import SearchConfig, SearchState
 from failure.search.spaces import SPACES
 
-__all__ = [
-    "FORMAT",
-    "append_log",
-    "claim",
-    "identity_of",
-    "load_tree",
-    "read_log",
-    "samples",
-    "save_tree",
-    "set_aside",
-]
-
 FORMAT = 2
 """Version of the folder; 1 kept neither column, sense, simulator nor start."""
 

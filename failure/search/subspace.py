@@ -16,8 +16,6 @@ from failure.search.history import SearchConfig
 from failure.search.spaces import ActiveSubspace
 from failure.search.task import unit_scale
 
-__all__ = ["active_basis", "subspace_of_gradient", "train_subspace"]
-
 Gradient = Callable[[Any], Any]
 """`x [n, D] -> dy/dx [n, D]`"""
 

@@ -9,8 +9,6 @@ import jax.numpy as jnp
 
 from failure.models.optimize import Domain, ball, box
 
-__all__ = ["KINDS", "SENSES", "Task", "sign_of", "task_domain", "unit_scale"]
-
 KINDS = ("box", "ball")
 SENSES = ("max", "min")
 

@@ -12,8 +12,6 @@ import numpy as np
 from failure.models.optimize import project, sample
 from failure.search.task import Task, sign_of, task_domain
 
-__all__ = ["Reach", "reachable"]
-
 
 class Reach(NamedTuple):
     """Nominal value, worst value found, where, and the threshold in between."""

@@ -11,8 +11,6 @@ from jaxtyping import Array, Float
 
 from failure.models.optimize import Domain
 
-__all__ = ["TurboConfig", "region_length", "trust_region"]
-
 
 @dataclass(frozen=True)
 class TurboConfig:

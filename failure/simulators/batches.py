@@ -16,8 +16,6 @@ from failure.simulators.processes import Group, SimulatorError
 from failure.simulators.result_cache import Cache
 from failure.status import Status
 
-__all__ = ["Attempt", "Batch", "Result", "check_points"]
-
 _log = logging.getLogger("failure.simulators")
 
 Result = tuple[list[float], int, str]

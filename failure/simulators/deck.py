@@ -10,8 +10,6 @@ from pathlib import Path
 
 from failure.simulators.spice import format_number, parse_number
 
-__all__ = ["Deck", "read_deck"]
-
 _ASSIGN = re.compile(r"""([A-Za-z_]\w*)(\s*=\s*)(\{[^}]*\}|'[^']*'|"[^"]*"|[^\s,;$]+)""")
 _FILE = re.compile(r"""^(\s*\.(?:include|inc|lib)\s+)(["']?)([^\s"']+)\2(.*)$""", re.IGNORECASE)
 _COMMENT = re.compile(r"^\s*\*|(?:\s\$|;).*$")

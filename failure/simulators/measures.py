@@ -12,8 +12,6 @@ from jaxtyping import Float
 
 from failure.simulators.spice import parse_number
 
-__all__ = ["Limit", "one_sided", "parse_limit", "violation"]
-
 _NAME = r"[A-Za-z_][\w.:()\[\]#@]*"
 _ONE = re.compile(rf"({_NAME})(<=|>=|<|>)(\S+)")
 _TWO = re.compile(rf"(\S+?)<=?({_NAME})<=?(\S+)")

@@ -23,8 +23,6 @@ from failure.simulators.spice import printed_numbers, printed_trouble
 from failure.simulators.variation import Corner, Variation
 from failure.status import Status
 
-__all__ = ["INVALID", "NetlistSimulator"]
-
 NGSPICE = "ngspice -b -n {deck}"
 INVALID = ("fail", "ignore", "stop")
 """What a missing or infinite measure is: a failure of its specification, nothing, or the end."""

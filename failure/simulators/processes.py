@@ -23,8 +23,6 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import NamedTuple
 
-__all__ = ["Finished", "Group", "SimulatorError", "end_group", "release", "watch"]
-
 _GUARD = """
 import os, signal, sys
 running = set()

@@ -14,8 +14,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["Cache", "load_record", "save_record"]
-
 _log = logging.getLogger("failure.simulators")
 
 

@@ -4,8 +4,6 @@ from __future__ import annotations
 
 import re
 
-__all__ = ["format_number", "parse_number", "printed_numbers", "printed_trouble"]
-
 _SCALE = {
     "t": 1e12, "g": 1e9, "meg": 1e6, "k": 1e3, "m": 1e-3, "mil": 25.4e-6, "u": 1e-6, "µ": 1e-6,
     "n": 1e-9, "p": 1e-12, "f": 1e-15,

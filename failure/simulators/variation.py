@@ -14,8 +14,6 @@ from jaxtyping import Float
 
 from failure.simulators.spice import parse_number
 
-__all__ = ["Corner", "Variation", "Varied", "parse_corner", "parse_variation", "pvt_corners"]
-
 
 class Varied(NamedTuple):
     """A parameter that varies: `nominal + sigma z`, or `nominal (1 + sigma z)` when relative."""

@@ -23,8 +23,6 @@ from failure.simulators.batches import Batch
 from failure.simulators.processes import Group, SimulatorError, end_group
 from failure.status import Status
 
-__all__ = ["CommandSimulator", "FunctionSimulator", "Simulator"]
-
 
 class Simulator(Protocol):
     """Anything that maps samples to specifications; a circuit's `simulate` is one."""

@@ -10,8 +10,6 @@ import numpy as np
 from fusion._checks import check_number
 from fusion.data.dataset import Dataset, apply_scale, check_dataset, draw_groups, fit_scale
 
-__all__ = ["from_arrays"]
-
 
 def _windows(x: Any, channels: Sequence[str] | None) -> np.ndarray:
     try:

@@ -10,16 +10,6 @@ import numpy as np
 
 from fusion._checks import check_number
 
-__all__ = [
-    "Dataset",
-    "Scale",
-    "apply_scale",
-    "check_dataset",
-    "draw_groups",
-    "fit_scale",
-    "validation_split",
-]
-
 
 @dataclasses.dataclass(frozen=True, eq=False)
 class Scale:

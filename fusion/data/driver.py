@@ -17,17 +17,6 @@ from fusion._checks import check_choice
 from fusion.data.dataset import Dataset, apply_scale, check_dataset, draw_groups, fit_scale
 from fusion.data.locate import locate, missing_message
 
-__all__ = [
-    "DRIVER_CHANNELS",
-    "DRIVER_CLASSES",
-    "DRIVER_FILES",
-    "DRIVER_REPLACEMENTS",
-    "DRIVER_SOURCE_CHANNELS",
-    "DriverFeatures",
-    "DriverSplit",
-    "load_driver",
-]
-
 DriverFeatures = Literal["complete", "source"]
 DriverSplit = Literal["random", "trip"]
 

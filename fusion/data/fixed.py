@@ -6,8 +6,6 @@ from fusion.data.dataset import Dataset
 from fusion.data.driver import DRIVER_CHANNELS, DRIVER_SOURCE_CHANNELS
 from fusion.failures import Protocol, fixed_failing
 
-__all__ = ["DRIVER_FIXED_CLEAN", "HAR_FIXED_FAILING", "fixed_sets", "published_fixed"]
-
 # n_clean -> channels that fail. The text names three channels where four must fail and two where
 # three must; these sets follow its names and have the right sizes.
 HAR_FIXED_FAILING: dict[int, tuple[str, ...]] = {

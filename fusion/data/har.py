@@ -18,8 +18,6 @@ import numpy as np
 from fusion.data.dataset import Dataset, apply_scale, check_dataset, fit_scale
 from fusion.data.locate import cache_dir, locate, missing_message
 
-__all__ = ["HAR_CHANNELS", "HAR_CLASSES", "HAR_FILES", "load_har"]
-
 HAR_CHANNELS = tuple(
     f"{signal}_{axis}" for signal in ("body_acc", "body_gyro", "total_acc") for axis in "xyz"
 )

@@ -6,8 +6,6 @@ import os
 from collections.abc import Iterator, Sequence
 from pathlib import Path
 
-__all__ = ["CACHE_NAME", "ENVIRONMENT", "cache_dir", "locate", "missing_message"]
-
 ENVIRONMENT = "FUSION_DATA_DIR"
 CACHE_NAME = "snn-fusion-failure"
 

@@ -25,8 +25,6 @@ from fusion._checks import check_count, check_number
 from fusion.data.dataset import Dataset, apply_scale, check_dataset, fit_scale
 from fusion.failures import Protocol
 
-__all__ = ["SimulatedConfig", "bayes_accuracy", "load_simulated", "oracle_accuracy"]
-
 FIRST_CYCLES = 2  # cycles per window of class 0
 N_SUBJECTS = 10  # groups of the training rows, for a validation split by group
 

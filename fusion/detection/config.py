@@ -11,8 +11,6 @@ from fusion.gating import Normalizer
 from fusion.losses import LossConfig
 from fusion.targets import TargetConfig
 
-__all__ = ["CAR_SIZES", "DETECTORS", "DenseConfig", "DetectorConfig", "DetectorModel"]
-
 DetectorModel = Literal["avod", "avod_argate", "dense", "dense_argate"]
 DETECTORS: tuple[str, ...] = get_args(DetectorModel)
 

@@ -15,8 +15,6 @@ from fusion.detection.kitti.calibration import lidar_to_camera, project
 from fusion.detection.kitti.files import Frame
 from fusion.detection.kitti.objects import Objects, select
 
-__all__ = ["plot_bird", "plot_detections", "plot_image", "plot_precision", "plot_training"]
-
 TRUTH, FOUND = "#009e73", "#e69f00"
 # The four edges of the bottom, of the top, and between them.
 _EDGES = [(0, 1), (1, 2), (2, 3), (3, 0), (4, 5), (5, 6), (6, 7), (7, 4)]

@@ -11,8 +11,6 @@ from fusion.detection.geometry.bev import BevConfig
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.training import DetectorTrainConfig
 
-__all__ = ["SIZES", "DetectorSetup", "Size", "preset"]
-
 Size = Literal["paper", "small", "tiny"]
 SIZES: tuple[str, ...] = get_args(Size)
 

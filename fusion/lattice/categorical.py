@@ -25,8 +25,6 @@ from fusion.lattice.projections import (
 )
 from fusion.lattice.rounding import frame, onto, working
 
-__all__ = ["CategoricalConfig", "CategoricalParams", "apply", "check", "init", "project"]
-
 
 class CategoricalParams(NamedTuple):
     """`outputs` `[n_categories]`; `missing` `[]`, or `None` where no category is missing."""

@@ -11,16 +11,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Shaped
 
-__all__ = [
-    "refusal",
-    "require_count",
-    "require_key",
-    "require_range",
-    "require_signs",
-    "require_static",
-    "require_width",
-]
-
 
 def refusal(name: str, value: object, expected: str, fix: str) -> ValueError:
     """The error of a bad value: `name=value: expected ...; fix`.

@@ -17,8 +17,6 @@ from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.projections import dykstra, isotonic
 from fusion.lattice.rounding import frame, onto, working
 
-__all__ = ["interior", "project_vertices", "violation"]
-
 
 def interior(config: LatticeConfig, signs: np.ndarray | Array) -> np.ndarray | Array:
     """A lattice `[*sizes]` with slack >= 1 in every order and trust inequality, from 0 upwards."""

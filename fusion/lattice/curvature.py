@@ -12,8 +12,6 @@ from jaxtyping import Array, Float
 from fusion.lattice.projections import dykstra, isotonic
 from fusion.lattice.rounding import Frame
 
-__all__ = ["bent", "curvature", "project_bent"]
-
 # Rounding to steps bends by one step at most, and so little more comes from the arithmetic.
 _SLACK = 4.0
 

@@ -25,8 +25,6 @@ from fusion.lattice.checks import (
 )
 from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
 
-__all__ = ["DeepLatticeConfig", "DeepLatticeParams", "apply", "check", "init", "project"]
-
 
 class DeepLatticeParams(NamedTuple):
     """Parameters of the four stages; a leading axis of networks can be vmapped over all of them."""

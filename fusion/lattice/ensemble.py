@@ -22,8 +22,6 @@ from fusion.lattice.checks import (
 from fusion.lattice.constraints import project_vertices, violation
 from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
 
-__all__ = ["EnsembleConfig", "apply", "check", "init", "project", "random_features"]
-
 
 def random_features(
     seed: int, n_inputs: int, n_lattices: int, rank: int

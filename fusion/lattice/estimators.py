@@ -18,8 +18,6 @@ from fusion.lattice.optimizer import with_projection
 from fusion.lattice.premade import CalibratedConfig, Feature
 from fusion.lattice.quantiles import quantile_keypoints
 
-__all__ = ["LatticeClassifier", "LatticeRegressor"]
-
 
 class _Estimator:
     """Settings are the arguments of `__init__`, what is learned has a trailing underscore."""

@@ -16,8 +16,6 @@ from fusion.lattice.checks import (
     require_static,
 )
 
-__all__ = ["LatticeConfig", "LatticeParams"]
-
 
 class LatticeParams(NamedTuple):
     """`vertices` `[*sizes]`: the output at each vertex, axis d is input d."""

@@ -15,8 +15,6 @@ from fusion.lattice.constraints import project_vertices, violation
 from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
 from fusion.lattice.rounding import frame, onto
 
-__all__ = ["apply", "check", "init", "project", "vertices"]
-
 
 def init(key: Key[Array, ""], config: LatticeConfig) -> LatticeParams:
     """A plane across the output range, up or down with monotone inputs, at random with free ones.

@@ -27,8 +27,6 @@ from fusion.lattice.projections import (
 )
 from fusion.lattice.rounding import working
 
-__all__ = ["LinearConfig", "LinearParams", "apply", "check", "init", "project"]
-
 # An equality (norm = 1) cannot be met to the last bit in floating point: `check` forgives this
 # many epsilons per weight.
 _NORM_TOLERANCE = 4.0

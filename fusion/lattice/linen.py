@@ -18,15 +18,6 @@ from fusion.lattice import linear as linear_layer
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.tagged import init_tagged, layer_of
 
-__all__ = [
-    "CategoricalCalibration",
-    "DeepLattice",
-    "Ensemble",
-    "Lattice",
-    "Linear",
-    "PWLCalibration",
-]
-
 
 class _Layer(nn.Module):
     """What all layers share: a tagged parameter `layer`, and `apply` of its functions."""

@@ -24,17 +24,6 @@ from fusion.lattice.linear import LinearConfig
 from fusion.lattice.pwl import PWLConfig
 from fusion.lattice.tagged import init_tagged, layer_of
 
-__all__ = [
-    "CategoricalCalibration",
-    "DeepLattice",
-    "Ensemble",
-    "Lattice",
-    "Linear",
-    "PWLCalibration",
-    "check_model",
-    "projection",
-]
-
 
 def _named(params: Any) -> dict[str, Any]:
     """The arrays of a layer by flat names, such as `embedding_weights`."""

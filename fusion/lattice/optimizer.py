@@ -12,8 +12,6 @@ import optax
 from fusion.lattice.checks import refusal
 from fusion.lattice.tagged import project_tree
 
-__all__ = ["with_projection"]
-
 
 def with_projection(
     optimizer: optax.GradientTransformation, project: Callable[[Any], Any] = project_tree

@@ -15,8 +15,6 @@ if TYPE_CHECKING:
     from matplotlib.axes import Axes
     from matplotlib.figure import Figure
 
-__all__ = ["plot_calibrator", "plot_categorical", "plot_lattice_slice"]
-
 
 def _axes(ax: Axes | None) -> Axes:
     if ax is not None:

@@ -27,8 +27,6 @@ from fusion.lattice.checks import (
 )
 from fusion.lattice.lattice_config import LatticeConfig
 
-__all__ = ["CalibratedConfig", "CalibratedParams", "Feature", "apply", "check", "init", "project"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Feature:

@@ -16,15 +16,6 @@ from jaxtyping import Array, Float
 
 from fusion.lattice.checks import refusal
 
-__all__ = [
-    "dykstra",
-    "isotonic",
-    "order_closure",
-    "order_depth",
-    "pair_projections",
-    "repair_order",
-]
-
 # Longest axis for which `isotonic` is written out; chosen by timing 5 to 20 on one CPU thread.
 _UNROLLED = 16
 

@@ -24,16 +24,6 @@ from fusion.lattice.curvature import bent, curvature, project_bent
 from fusion.lattice.projections import isotonic
 from fusion.lattice.rounding import frame, onto, working
 
-__all__ = [
-    "PWLConfig",
-    "PWLParams",
-    "apply",
-    "check",
-    "init",
-    "keypoints",
-    "project",
-]
-
 
 class PWLParams(NamedTuple):
     """What is learned by a layer of calibrators.

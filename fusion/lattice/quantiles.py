@@ -7,8 +7,6 @@ from jaxtyping import Float
 
 from fusion.lattice.checks import refusal, require_count
 
-__all__ = ["quantile_keypoints"]
-
 
 def quantile_keypoints(
     data: Float[np.ndarray, "n_rows n_inputs"], n_keypoints: int = 10

@@ -11,14 +11,6 @@ from fusion.lattice.checks import refusal
 from fusion.lattice.lattice_config import LatticeParams
 from fusion.lattice.pwl import PWLParams
 
-__all__ = [
-    "lattice_laplacian",
-    "lattice_torsion",
-    "pwl_hessian",
-    "pwl_laplacian",
-    "pwl_wrinkle",
-]
-
 
 def _penalty(differences: Array, l1: float, l2: float) -> Array:
     return l1 * jnp.sum(jnp.abs(differences)) + l2 * jnp.sum(jnp.square(differences))

@@ -19,8 +19,6 @@ from jaxtyping import Array, Float
 
 from fusion.lattice.checks import refusal
 
-__all__ = ["Frame", "frame", "onto", "snap", "working"]
-
 # Where both bounds are given they fix the step: two units in the last place of the larger one.
 # Otherwise the largest parameter does, and it may shrink in one step by about these factors.
 _SPARE_BITS = {"float32": 4, "float64": 4}

@@ -22,8 +22,6 @@ from fusion.lattice import categorical, deep_lattice, ensemble, lattice_layer, l
 from fusion.lattice.checks import refusal
 from fusion.lattice.lattice_config import LatticeConfig
 
-__all__ = ["Tagged", "check_tree", "init_tagged", "layer_of", "project_tree", "tag"]
-
 LAYERS: dict[type, ModuleType] = {
     pwl.PWLConfig: pwl,
     categorical.CategoricalConfig: categorical,

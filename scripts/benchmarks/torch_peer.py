@@ -14,8 +14,6 @@ import torch
 from torch import Tensor, nn
 from torch.nn import functional
 
-__all__ = ["GroupedNet", "LoopNet", "load_parameters", "train_epoch"]
-
 
 def _basis(n: int) -> Tensor:
     """Hann-windowed cosine and sine columns, as `fusion.encoders` has them."""

@@ -11,8 +11,6 @@ from failure.circuits import Circuit, Spec
 from failure.status import Status
 from snn_fusion_failure.sweeps.source import find_function
 
-__all__ = ["find_circuit"]
-
 
 class _OwnCircuit(Circuit):
     """A circuit whose samples a function computes, one after another, in this process."""

@@ -214,7 +214,7 @@ def _simulated(plan: Plan, out: Path, seeds: int) -> Done:
 
 def failures(plan: Plan, tables: Sequence[str]) -> Done:
     """Tables 4.1 and 4.2: searches for failures of a circuit."""
-    from failure.search.history import METHODS
+    from failure.search.methods import METHODS
     from snn_fusion_failure.records import failure_tables
 
     quick = plan.preset == "quick"

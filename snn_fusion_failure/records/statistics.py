@@ -9,14 +9,6 @@ import numpy as np
 from jax.typing import ArrayLike
 from scipy import special
 
-__all__ = [
-    "Interval",
-    "PairedTest",
-    "bootstrap_interval",
-    "mean_interval",
-    "paired_test",
-]
-
 
 class Interval(NamedTuple):
     """Mean of n runs with a confidence interval and the standard deviation of one run."""

@@ -18,8 +18,6 @@ from snn_fusion_failure.sweeps.axes import Axis
 from snn_fusion_failure.sweeps.designs import digest, shares
 from snn_fusion_failure.sweeps.folder import Sweep
 
-__all__ = ["ask", "check_adaptive", "rows_at"]
-
 Row = tuple[Any, ...]
 
 

@@ -12,8 +12,6 @@ from snn_fusion_failure.sweeps.leaves import parse_number
 from snn_fusion_failure.sweeps.study import Study, load_study
 from snn_fusion_failure.sweeps.trial import from_trial
 
-__all__ = ["DRAWN", "read_axes"]
-
 DRAWN = ("random", "sobol", "tpe", "cma", "gp")
 """Designs whose settings are drawn; their names are the options that list their axes."""
 

@@ -19,11 +19,6 @@ import numpy as np
 
 from snn_fusion_failure.sweeps.leaves import parse_number
 
-__all__ = [
-    "Axis", "Kind", "categorical", "choice", "grid", "integers", "loguniform", "parse_axis",
-    "uniform",
-]  # fmt: skip
-
 Kind = Literal["float", "int", "category", "static"]
 
 

@@ -22,8 +22,6 @@ import numpy as np
 
 from snn_fusion_failure.sweeps.chunkfile import load_chunk, save_chunk
 
-__all__ = ["chunk_costs", "in_processes", "write_chunks", "writer_rates"]
-
 
 def write_chunks(folder: str, first: int, count: int, n_trials: int) -> list[float]:
     """Seconds that each of `count` chunk files took to write."""

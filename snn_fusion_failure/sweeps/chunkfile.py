@@ -14,8 +14,6 @@ import numpy as np
 
 from snn_fusion_failure.runs.files import write_bytes
 
-__all__ = ["DamagedError", "load_chunk", "save_chunk", "set_aside"]
-
 _MARK = b"sha256:"
 _TAIL = len(_MARK) + 64
 

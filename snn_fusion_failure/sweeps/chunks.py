@@ -24,8 +24,6 @@ from snn_fusion_failure.sweeps.results import Reader
 from snn_fusion_failure.sweeps.rungs import is_complete, next_work
 from snn_fusion_failure.sweeps.worker import Worker
 
-__all__ = ["Outcome", "Progress", "run_shard"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Progress:

@@ -16,8 +16,6 @@ import numpy as np
 
 from snn_fusion_failure.sweeps.axes import Axis
 
-__all__ = ["ADAPTIVE", "KINDS", "Design", "design", "digest", "shares"]
-
 ADAPTIVE = ("tpe", "cma", "gp")
 KINDS = ("grid", "random", "sobol", *ADAPTIVE)
 

@@ -36,8 +36,6 @@ from snn_fusion_failure.sweeps.source import folder_of
 from snn_fusion_failure.sweeps.study import Study
 from snn_fusion_failure.sweeps.worker import check_source, retry_failed
 
-__all__ = ["Layout", "build", "collect", "execute", "open_sweep", "parse_shard"]
-
 
 @dataclasses.dataclass(frozen=True)
 class Layout:

@@ -8,8 +8,6 @@ from typing import Any
 from snn_fusion_failure.runs.files import write_bytes, write_text
 from snn_fusion_failure.sweeps.folder import STATUS
 
-__all__ = ["export", "frame"]
-
 
 def frame(dataset: Any) -> Any:
     """A `pandas.DataFrame` with a row per trial: axes, seed, metrics, status in words."""

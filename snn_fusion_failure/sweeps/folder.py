@@ -30,12 +30,6 @@ from snn_fusion_failure.sweeps.axes import Axis
 from snn_fusion_failure.sweeps.designs import Design, digest
 from snn_fusion_failure.sweeps.study import Metric, Study
 
-__all__ = [
-    "FAILED", "MISSING", "NON_FINITE", "OK", "STATUS", "Segment", "Sweep", "all_chunks",
-    "append_plan", "chunk_name", "chunk_path", "claim", "done_chunks", "forget", "held_sweep",
-    "read_plan", "segments_of", "valid",
-]  # fmt: skip
-
 OK, NON_FINITE, FAILED, MISSING = 0, 1, 2, 3
 STATUS = ("ok", "non-finite", "failed", "missing")
 SCHEME = 2

@@ -13,8 +13,6 @@ from snn_fusion_failure.sweeps.study import Metric, Study, load_study
 from snn_fusion_failure.sweeps.trial import Trial, from_trial
 from snn_fusion_failure.sweeps.worker import brief
 
-__all__ = ["axes_of", "sweep"]
-
 
 def axes_of(space: Mapping[str, Axis], study: Study | None = None) -> list[Axis]:
     """The axes of a space, named, with the units of a study.

@@ -24,8 +24,6 @@ from snn_fusion_failure.sweeps.folder import (
 from snn_fusion_failure.sweeps.results import Found, Reader
 from snn_fusion_failure.sweeps.rungs import is_complete
 
-__all__ = ["RESERVED", "damaged", "gather", "write_netcdf"]
-
 RESERVED = ("seed", "setting", "status", "budget", "source")
 """Names of the data set's own variables: no axis and no metric can have them."""
 

@@ -21,8 +21,6 @@ import numpy as np
 from snn_fusion_failure.sweeps.rank import axis_columns, axis_names, per_setting
 from snn_fusion_failure.sweeps.results import setting_scores
 
-__all__ = ["importance"]
-
 
 def importance(dataset: Any) -> dict[str, tuple[float, float | None]]:
     """Own and total share of each axis.

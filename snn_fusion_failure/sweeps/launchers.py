@@ -33,8 +33,6 @@ from snn_fusion_failure.sweeps.results import Reader
 from snn_fusion_failure.sweeps.rungs import next_work
 from snn_fusion_failure.sweeps.worker import Worker
 
-__all__ = ["OnChunk", "launch_local", "launch_ray", "launch_submitit", "standing", "work"]
-
 OnChunk = Callable[[Progress], None]
 _POLL = 0.5  # seconds between looks into the folder
 _CHILD = """

@@ -15,8 +15,6 @@ import socket
 import threading
 from pathlib import Path
 
-__all__ = ["DEATHS", "Lease", "deaths", "held", "take"]
-
 DEATHS = 3
 """Workers that may die in a chunk before it is given up."""
 

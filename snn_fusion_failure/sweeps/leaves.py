@@ -9,8 +9,6 @@ from typing import Any
 
 import numpy as np
 
-__all__ = ["PREFIXES", "UNITS", "batch", "in_unit", "leaf_names", "parse_number", "resolve"]
-
 # What one of a unit is in the unit that the code computes with.
 UNITS = {
     "s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9,

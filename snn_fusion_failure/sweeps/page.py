@@ -19,8 +19,6 @@ from snn_fusion_failure.runs.files import write_text
 from snn_fusion_failure.sweeps.folder import STATUS, valid
 from snn_fusion_failure.sweeps.rank import axis_columns, mean_of, per_setting
 
-__all__ = ["page_data", "write_page"]
-
 
 def page_data(dataset: Any) -> dict[str, Any]:
     """What the page draws, JSON values: axes, metrics, and settings with means over valid seeds."""

@@ -15,8 +15,6 @@ from snn_fusion_failure.sweeps.rank import axis_columns, axis_names, rank, value
 if TYPE_CHECKING:
     from matplotlib.figure import Figure
 
-__all__ = ["plot_all", "plot_heat_map", "plot_parallel"]
-
 
 def plot_all(dataset: Any, *, pairs: int = 6) -> dict[str, Figure]:
     """Heat maps (of a grid, at most `pairs`) and parallel coordinates, by file name."""

@@ -16,11 +16,6 @@ import numpy as np
 from snn_fusion_failure.sweeps.leaves import batch
 from snn_fusion_failure.sweeps.study import Study
 
-__all__ = [
-    "Program", "compile_study", "fastest", "measure_widths", "out_of_memory", "widths_to_try",
-]  # fmt: skip
-
-
 # (columns {leaf: [n]}, words [n, 2], seeds [n], carry) -> {metric: [n]} float64, carry leaves
 Program = Callable[..., tuple[dict[str, np.ndarray], list[np.ndarray]]]
 

@@ -6,8 +6,6 @@ import heapq
 
 import numpy as np
 
-__all__ = ["simulate"]
-
 
 def simulate(
     workers: int, chunk_s: float, file_s: float, *, per_worker: int = 20, spread: float = 0.3,

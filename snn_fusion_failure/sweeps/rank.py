@@ -11,8 +11,6 @@ from snn_fusion_failure.records.rows import summarize
 from snn_fusion_failure.sweeps.folder import FAILED, NON_FINITE, STATUS, valid
 from snn_fusion_failure.sweeps.results import setting_scores
 
-__all__ = ["axis_columns", "axis_names", "compare", "pareto", "per_setting", "rank", "table"]
-
 
 def axis_names(dataset: Any) -> list[str]:
     """The swept leaves, in the order of the command line."""

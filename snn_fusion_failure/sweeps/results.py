@@ -21,8 +21,6 @@ from snn_fusion_failure.sweeps.folder import (
     valid,
 )
 
-__all__ = ["Found", "Reader", "setting_scores"]
-
 
 @dataclasses.dataclass
 class Found:

@@ -33,8 +33,6 @@ from snn_fusion_failure.sweeps.folder import (
 )
 from snn_fusion_failure.sweeps.results import Reader, setting_scores
 
-__all__ = ["check_halving", "derive", "grow", "is_complete", "next_work", "promotions", "survivors"]
-
 Work = tuple[list[tuple[Any, ...]], list[dict[str, Any]]]
 
 

@@ -23,8 +23,6 @@ from typing import Any
 from snn_fusion_failure.runs.origin import versions
 from snn_fusion_failure.runs.repository import ROOT
 
-__all__ = ["changes", "find_function", "fingerprint", "folder_of", "sources"]
-
 _OURS = ("jaxsnn", "fusion", "failure", "snn_fusion_failure")
 
 

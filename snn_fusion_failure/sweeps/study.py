@@ -16,11 +16,6 @@ from typing import Any, Literal
 
 from snn_fusion_failure.sweeps.leaves import leaf_names, resolve
 
-__all__ = [
-    "STUDIES", "Carry", "Metric", "Study", "is_trial", "load_study", "make_study", "options_of",
-    "parse_options", "parse_pairs",
-]  # fmt: skip
-
 # name -> where it is made
 STUDIES = {
     "snn": "snn_fusion_failure.sweeps.studies.snn:make",

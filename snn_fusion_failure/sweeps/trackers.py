@@ -17,8 +17,6 @@ from snn_fusion_failure.sweeps.gather import gather
 from snn_fusion_failure.sweeps.rank import axis_columns, mean_of, per_setting
 from snn_fusion_failure.sweeps.results import Reader
 
-__all__ = ["TRACKERS", "Tracker", "make_tracker"]
-
 
 class Tracker(Protocol):
     """Where finished settings are sent."""

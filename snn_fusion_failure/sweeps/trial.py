@@ -8,8 +8,6 @@ from typing import Any
 from snn_fusion_failure.sweeps.axes import Axis
 from snn_fusion_failure.sweeps.study import Metric, Study
 
-__all__ = ["from_trial", "name_of"]
-
 Trial = Callable[[Any, Any], Mapping[str, Any]]
 
 

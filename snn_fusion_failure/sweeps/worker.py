@@ -26,8 +26,6 @@ from snn_fusion_failure.sweeps.program import Program, compile_study, out_of_mem
 from snn_fusion_failure.sweeps.source import changes, fingerprint
 from snn_fusion_failure.sweeps.study import Study
 
-__all__ = ["Worker", "brief", "check_source", "retry_failed"]
-
 
 def check_source(sweep: Sweep) -> dict[str, Any]:
     """The fingerprint of the study's source, noted in the folder.

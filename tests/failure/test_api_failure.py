@@ -13,7 +13,9 @@ from failure import bnn, revnet
 from failure.circuits.buck import cycle
 from failure.circuits.solver import mosfet
 from failure.models import acquisition, gp, gp_fit, optimize
+from failure.models.kernels import KERNELS
 from failure.search import spaces, turbo
+from failure.search.task import task_domain
 from tests._api import Case, check
 
 N, D = 6, 2
@@ -111,7 +113,7 @@ CASES = [
             lambda rng: (*data(rng)[:2], rng.normal(size=(3, D))),
             (0, 1, 2),
         )
-        for kernel in gp.KERNELS
+        for kernel in KERNELS
     ),
     Case("gp.condition", lambda p, x, y: posterior(p, x, y).alpha, data, (0, 1, 2)),
     Case(
@@ -142,7 +144,7 @@ CASES = [
     Case(
         "spaces.random_embedding (decode)",
         lambda u: spaces.random_embedding(TASK, 2, key=jax.random.key(0)).decode(
-            spaces.task_domain(TASK), u
+            task_domain(TASK), u
         ),
         lambda rng: (rng.uniform(-0.4, 0.4, 2),),
     ),

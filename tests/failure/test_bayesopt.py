@@ -7,7 +7,7 @@ import pytest
 
 from failure.models.acquisition import AcquisitionConfig
 from failure.search import bayesopt, runs
-from failure.search.spaces import Task
+from failure.search.task import Task
 
 DIM = 4
 ACQ = AcquisitionConfig(n_raw=64, n_restarts=3, max_evals=30)

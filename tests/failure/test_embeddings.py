@@ -5,7 +5,7 @@ import pytest
 
 from failure import revnet
 from failure.search import spaces
-from failure.search.spaces import Task
+from failure.search.task import Task, task_domain
 
 BOX, BALL = Task("box", 3.0, 6), Task("ball", 4.0, 6)
 
@@ -24,14 +24,14 @@ def full(task):
 def test_unit_coordinates_have_the_variance_of_a_unit_cube(task):
     u = spaces.initial_design(full(task), task, 20_000, key=jax.random.key(0))
     np.testing.assert_allclose(np.var(u, axis=0), 1 / 12, rtol=0.05)
-    x, clipped = full(task).decode(spaces.task_domain(task), u[0])
+    x, clipped = full(task).decode(task_domain(task), u[0])
     assert float(clipped) == 0.0
     np.testing.assert_allclose(full(task).encode(x), u[0], rtol=1e-12)
 
 
 def test_random_embedding_is_the_clipped_linear_map():
     space = spaces.random_embedding(BOX, 2, key=jax.random.key(0))
-    domain = spaces.task_domain(BOX)
+    domain = task_domain(BOX)
     u = jnp.asarray([0.1, -0.05])
     z = 2 * np.sqrt(2) * np.asarray(u)
     raw = 3.0 * np.asarray(space.matrix) @ z
@@ -49,7 +49,7 @@ def test_random_embedding_is_the_clipped_linear_map():
 @pytest.mark.parametrize("task", [BOX, BALL])
 def test_slope_of_decode_agrees_with_differences(task):
     space = spaces.random_embedding(task, 2, key=jax.random.key(0))
-    domain = spaces.task_domain(task)
+    domain = task_domain(task)
     # the first point clips some coordinates of the box, and leaves the ball
     for u in (jnp.asarray([0.31, -0.24]), jnp.asarray([0.02, -0.03])):
         decode = jax.jit(lambda u: space.decode(domain, u)[0])
@@ -69,7 +69,7 @@ def reversed_space(order, n_active):
 
 def test_reversed_features_put_zeros_into_the_inactive_ones():
     space = reversed_space([4, 0, 2, 1, 3, 5], 2)
-    domain = spaces.task_domain(Task("box", 50.0, 6))
+    domain = task_domain(Task("box", 50.0, 6))
     u = jnp.asarray([0.3, -0.2])
     x, clipped = space.decode(domain, u)
     z = np.asarray(revnet.forward(space.network, x / 1.5))
@@ -83,7 +83,7 @@ def test_all_features_active_give_any_x_back():
     space = reversed_space([4, 0, 2, 1, 3, 5], 6)
     x = jnp.asarray([0.5, -2.0, 1.0, 0.0, 2.5, -1.0])
     u = space.encode(x)
-    back, clipped = space.decode(spaces.task_domain(BOX), u)
+    back, clipped = space.decode(task_domain(BOX), u)
     np.testing.assert_allclose(back, x, atol=1e-10)
     assert float(clipped) == 0.0
 
@@ -91,9 +91,9 @@ def test_all_features_active_give_any_x_back():
 def test_a_restored_point_outside_the_set_is_projected_and_reported():
     space = reversed_space([0, 1, 2, 3, 4, 5], 2)
     u = jnp.asarray([40.0, -40.0])
-    x, clipped = space.decode(spaces.task_domain(BOX), u)
+    x, clipped = space.decode(task_domain(BOX), u)
     assert np.all(np.abs(x) <= 3.0) and float(clipped) > 0.0
-    x, clipped = space.decode(spaces.task_domain(BALL), u)
+    x, clipped = space.decode(task_domain(BALL), u)
     assert np.isclose(np.linalg.norm(x), 4.0) and float(clipped) == 1.0
 
 

@@ -9,6 +9,7 @@ import pytest
 
 from failure.models import gp, gp_fit
 from failure.models.acquisition import log_ei
+from failure.models.kernels import KERNELS
 
 TOLERANCE = 1e-8
 
@@ -51,7 +52,7 @@ def botorch_cases(golden):
     return {case["kernel"]: case for case in cases}
 
 
-@pytest.mark.parametrize("kernel", gp.KERNELS)
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_evidence_posterior_and_gradients_are_those_of_botorch(botorch_cases, kernel):
     case = botorch_cases[kernel]
     config, params = gp.GPConfig(kernel=kernel), case_params(case)
@@ -108,7 +109,7 @@ def test_matern_and_rbf_are_those_of_tinygp(botorch_cases):
         np.testing.assert_allclose(variance, conditioned.gp.variance, rtol=1e-6, atol=1e-9)
 
 
-@pytest.mark.parametrize("kernel", gp.KERNELS)
+@pytest.mark.parametrize("kernel", KERNELS)
 def test_closed_form_gradient_is_that_of_autodiff(botorch_cases, kernel):
     case = botorch_cases[kernel]
     config, data = gp.GPConfig(kernel=kernel), padded(case)

@@ -9,7 +9,7 @@ from failure import rev_argate
 from failure.bnn import BNNConfig
 from failure.models.acquisition import AcquisitionConfig
 from failure.search import bayesopt, runs, spaces
-from failure.search.spaces import Task
+from failure.search.task import Task
 from fusion.losses import LossParams
 
 DIM = 6

@@ -8,7 +8,7 @@ import pytest
 from failure.search import runs
 from failure.search.bayesopt import SearchConfig
 from failure.search.sharing import side_by_side
-from failure.search.spaces import Task
+from failure.search.task import Task
 
 METHODS = ("monte_carlo", "ridge_corner", "gradient_corner")
 

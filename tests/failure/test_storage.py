@@ -7,7 +7,7 @@ import pytest
 
 from failure.search import runs
 from failure.search.methods import SearchConfig
-from failure.search.storage import identity_of, load_tree, save_tree
+from failure.search.storage import identity_of, load_tree, samples, save_tree
 from failure.search.task import Task
 from failure.status import Status
 
@@ -118,7 +118,7 @@ def test_a_folder_of_an_earlier_version_is_refused_and_its_samples_can_be_used(t
     (tmp_path / "search.json").write_text(json.dumps(held))
     with pytest.raises(ValueError, match=r"earlier version.*start_from"):
         runs.run(config(), two, folder=tmp_path)
-    x, y = runs.samples(tmp_path)
+    x, y = samples(tmp_path)
     assert x.shape == (20, 3) and y.shape == (20,)
 
 

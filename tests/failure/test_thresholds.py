@@ -2,7 +2,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure.search.spaces import Task
+from failure.search.task import Task
 from failure.search.thresholds import reachable
 
 

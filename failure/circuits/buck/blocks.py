@@ -27,8 +27,6 @@ from failure.circuits.solver.newton import dc
 from failure.circuits.solver.system import System, compile_netlist
 from failure.circuits.solver.transient import Grid, grid, transient
 
-__all__ = ["Amplifier", "Edges"]
-
 _T1, _T2, _T3, _T4, _T5 = 30e-9, 32e-9, 34e-9, 41.5e-9, 46e-9
 """Edge test: slow rise through V_COMP, quick rise to the top, top, fall, settled."""
 _EDGE_T = (0.0, _T1, _T2, _T3, _T4, _T5)

@@ -14,8 +14,6 @@ from failure.circuits.buck.reference import dcdc_reference
 from failure.circuits.buck.schematic import MOSFETS, QUANTITIES
 from failure.circuits.protocol import Circuit, Spec, in_chunks
 
-__all__ = ["make_dcdc", "make_dcdc_light"]
-
 
 def _run_dcdc(x: Float[Array, "n d"], *, model: str) -> tuple[Array, Array]:
     return in_chunks(partial(converter.solve_dcdc, model=model), x)

@@ -39,8 +39,6 @@ from failure.circuits.buck.schematic import (
 from failure.circuits.protocol import Spec
 from failure.status import Status
 
-__all__ = ["SPECS", "solve_dcdc"]
-
 SPECS = (
     Spec("output_accuracy", "V", "max", "distance of the mean output from the reference, 0.2 A"),
     Spec("overshoot", "V", "max", "peak of the output after the load step, over the reference"),

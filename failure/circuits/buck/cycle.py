@@ -13,8 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["Stage", "expm", "pwm_cycle", "stage_matrix", "until", "walk"]
-
 _SQUARINGS = 6
 _TERMS = 8
 

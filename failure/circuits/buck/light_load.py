@@ -26,15 +26,6 @@ from failure.circuits.solver.newton import dc
 from failure.circuits.solver.system import System, compile_netlist
 from failure.status import Status
 
-__all__ = [
-    "COMPARATOR",
-    "SPECS",
-    "Pulse",
-    "pfm_cycle",
-    "solve_dcdc_light",
-    "trip_offset",
-]
-
 LOAD = 10e-3
 """Light load [A]."""
 

@@ -17,8 +17,6 @@ from failure.circuits.solver.netlist import (
 )
 from failure.circuits.solver.system import compile_netlist
 
-__all__ = ["FULL", "dcdc_decks", "dcdc_reference"]
-
 FULL = Netlist(
     "buck converter",
     (

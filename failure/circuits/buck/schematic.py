@@ -10,8 +10,6 @@ from failure.circuits.solver.netlist import CurrentSource, Mosfet, Netlist, Volt
 from failure.circuits.solver.system import System
 from failure.circuits.solver.values import Values, nominal_values
 
-__all__ = ["AMPLIFIER", "MOSFETS", "POWER", "QUANTITIES"]
-
 V_DD, V_REF, V_BIAS = 2.5, 1.2, 0.72
 INDUCTANCE, R_COIL, CAPACITANCE, R_ESR = 1e-6, 0.03, 10e-6, 0.03
 R_COMP, R_ZERO, C_ZERO = 5e3, 20e3, 1e-12

@@ -12,8 +12,6 @@ from failure.circuits.protocol import Circuit, in_chunks
 from failure.circuits.solver.netlist import Mosfet
 from failure.circuits.solver.transient import Grid
 
-__all__ = ["make_ldo"]
-
 
 def _run(x: Float[Array, "n d"], *, model: str, time: Grid = TIME) -> tuple[Array, Array]:
     return in_chunks(partial(solve_ldo, model=model, time=time), x)

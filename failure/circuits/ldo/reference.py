@@ -21,8 +21,6 @@ from failure.circuits.solver import ngspice
 from failure.circuits.solver.netlist import Mosfet
 from failure.circuits.solver.system import compile_netlist
 
-__all__ = ["ldo_decks", "ldo_reference"]
-
 _STEP = ((0.0, I_LIGHT), (T_STEP, I_LIGHT), (T_STEP + T_RISE, I_HEAVY), (1.0, I_HEAVY))
 
 

@@ -29,17 +29,6 @@ from failure.circuits.solver.transient import Grid, grid, transient
 from failure.circuits.solver.values import Values, nominal_values
 from failure.status import Status
 
-__all__ = [
-    "I_HEAVY",
-    "I_LIGHT",
-    "NETLIST",
-    "QUANTITIES",
-    "SPECS",
-    "TIME",
-    "solve_ldo",
-    "time_grid",
-]
-
 KNEE = 1.0
 """Voltage scale of the load [V]: it draws `amps * tanh(v / KNEE)`, less as the output falls."""
 

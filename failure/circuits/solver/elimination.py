@@ -7,8 +7,6 @@ from jaxtyping import Array, Float
 
 from failure.circuits.solver.system import System
 
-__all__ = ["eliminate"]
-
 Entries = dict[tuple[int, int], Array]
 
 

@@ -28,14 +28,6 @@ from failure.circuits.solver.netlist import (
 from failure.circuits.solver.system import System, branches, pattern
 from failure.circuits.solver.values import Values, batch_size
 
-__all__ = [
-    "GMIN",
-    "Stamps",
-    "residual",
-    "source_current",
-    "stamps",
-]
-
 GMIN = 1e-12
 """Conductance from every unknown node to ground [S]."""
 

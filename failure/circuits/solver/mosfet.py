@@ -13,22 +13,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = [
-    "EPS_OX",
-    "MODELS",
-    "NMOS",
-    "PMOS",
-    "SLOPE",
-    "SMOOTH_VDS",
-    "U_T",
-    "MosParams",
-    "Process",
-    "drain_current",
-    "ekv",
-    "level1",
-    "mos_params",
-]
-
 EPS_OX = 3.9 * 8.8541878128e-12
 """Permittivity of silicon dioxide [F/m]."""
 

@@ -7,20 +7,6 @@ from dataclasses import dataclass, field
 
 from failure.circuits.solver.mosfet import Process
 
-__all__ = [
-    "GROUND",
-    "Capacitor",
-    "CurrentSource",
-    "Element",
-    "Inductor",
-    "Load",
-    "Mosfet",
-    "Netlist",
-    "Resistor",
-    "Switch",
-    "VoltageSource",
-]
-
 GROUND = "0"
 
 

@@ -16,8 +16,6 @@ from failure.circuits.solver.system import System
 from failure.circuits.solver.values import Values, batch_size
 from failure.status import Status
 
-__all__ = ["Solution", "dc", "newton"]
-
 V_TOL = 1e-7
 """A Newton step below this [V] ends a DC solve; what is left is its square."""
 

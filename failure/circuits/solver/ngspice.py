@@ -32,8 +32,6 @@ from failure.circuits.solver.netlist import (
 )
 from failure.circuits.solver.values import Values
 
-__all__ = ["NgspiceError", "available", "deck", "elements", "require", "run", "run_many"]
-
 Wave = Sequence[tuple[float, float]]
 
 

@@ -22,8 +22,6 @@ from failure.circuits.solver.netlist import (
     VoltageSource,
 )
 
-__all__ = ["System", "branches", "compile_netlist", "pattern"]
-
 
 def branches(netlist: Netlist) -> list[Inductor | VoltageSource]:
     """Elements whose current is an unknown: inductors, then floating voltage sources."""

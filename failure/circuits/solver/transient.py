@@ -22,8 +22,6 @@ from failure.circuits.solver.newton import (
 from failure.circuits.solver.system import System
 from failure.circuits.solver.values import Values, batch_size
 
-__all__ = ["Grid", "grid", "transient"]
-
 
 class Grid(NamedTuple):
     """Times of a transient [s]; per step: backward Euler or not, first of a piece or not."""

@@ -20,8 +20,6 @@ from failure.circuits.solver.netlist import (
 )
 from failure.circuits.solver.system import System
 
-__all__ = ["Values", "nominal_values"]
-
 
 class Values(NamedTuple):
     """Element values; leaves `[n_elements_of_that_kind, batch]`, or `[..., 1]` when common."""

@@ -15,8 +15,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fusion.detection.geometry.bev import BevConfig, cell_index
 
-__all__ = ["AnchorConfig", "Anchors", "anchor_grid", "cluster_sizes", "select_anchors"]
-
 
 @dataclasses.dataclass(frozen=True)
 class AnchorConfig:

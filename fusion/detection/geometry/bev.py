@@ -21,8 +21,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
 
-__all__ = ["BevConfig", "bev_maps", "cell_index", "ground_to_unit", "pad_points"]
-
 
 @dataclasses.dataclass(frozen=True)
 class BevConfig:

@@ -13,20 +13,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = [
-    "anchor_ground",
-    "angle_vector",
-    "box3d_to_anchor",
-    "box3d_to_box4c",
-    "box4c_to_box3d",
-    "box_corners",
-    "decode_offsets",
-    "encode_offsets",
-    "ground_box",
-    "project_boxes",
-    "resolve_heading",
-]
-
 Box3D = Float[Array, "n 7"]
 Anchor = Float[Array, "n 6"]
 

@@ -24,8 +24,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["box3d_iou", "ground_iou", "image_iou", "rotated_intersection"]
-
 Box2D = Float[Any, "*#batch 4"]
 GroundBox = Float[Any, "*#batch 5"]
 Box3D = Float[Any, "*#batch 7"]

@@ -18,8 +18,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-__all__ = ["PlaneConfig", "PlaneFit", "fit_plane", "height_above", "plane_difference", "plane_y"]
-
 
 @dataclasses.dataclass(frozen=True)
 class PlaneConfig:

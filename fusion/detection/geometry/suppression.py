@@ -14,8 +14,6 @@ from jaxtyping import Array, Bool, Float, Int
 
 from fusion.detection.geometry.overlaps import ground_iou, image_iou
 
-__all__ = ["nms", "pairwise"]
-
 _OVERLAPS: dict[str, Callable[[Array, Array], Array]] = {
     "upright": image_iou,
     "rotated": ground_iou,

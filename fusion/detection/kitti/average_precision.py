@@ -38,19 +38,6 @@ from fusion.detection.kitti.matching import (
 )
 from fusion.detection.kitti.objects import DONT_CARE, Objects, concatenate, select
 
-__all__ = [
-    "DIFFICULTIES",
-    "METRICS",
-    "MIN_HEIGHT",
-    "MIN_OVERLAP",
-    "Evaluation",
-    "average_precision_cap",
-    "evaluate",
-    "hardness_by_distance",
-    "hardness_by_points",
-    "recall_thresholds",
-]
-
 METRICS = ("2d", "orientation", "bev", "3d")
 DIFFICULTIES = ("easy", "moderate", "hard")
 MIN_OVERLAP: Mapping[str, float] = {"Car": 0.7, "Pedestrian": 0.5, "Cyclist": 0.5}

@@ -18,16 +18,6 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = [
-    "Calibration",
-    "back_project",
-    "camera_to_lidar",
-    "check_calibration",
-    "in_image",
-    "lidar_to_camera",
-    "project",
-]
-
 
 class Calibration(NamedTuple):
     """Matrices of one calibration file.

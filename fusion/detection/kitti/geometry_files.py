@@ -13,8 +13,6 @@ import numpy as np
 from fusion.detection.kitti.calibration import Calibration, check_calibration
 from fusion.detection.kitti.text import parse_number, read_lines
 
-__all__ = ["read_calibration", "read_plane", "write_calibration", "write_plane"]
-
 _CALIBRATION_KEYS = {
     "P0": (3, 4),
     "P1": (3, 4),

@@ -12,8 +12,6 @@ import numpy as np
 from fusion.detection.kitti.objects import DONT_CARE, KITTI_TYPES, NO_BOX3D, Objects, empty
 from fusion.detection.kitti.text import parse_number, read_lines
 
-__all__ = ["read_labels", "read_results", "write_labels", "write_results"]
-
 _LABEL_FIELDS = 15
 _TYPES = frozenset(KITTI_TYPES)
 _FIELD_NAMES = (

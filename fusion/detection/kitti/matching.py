@@ -22,20 +22,6 @@ from fusion.detection.geometry.overlaps import (
 )
 from fusion.detection.kitti.objects import Objects
 
-__all__ = [
-    "IGNORED",
-    "OTHER",
-    "VALID",
-    "Matches",
-    "Pairs",
-    "Table",
-    "coverage",
-    "frame_pairs",
-    "match",
-    "overlaps",
-    "table_of",
-]
-
 VALID, IGNORED, OTHER = 0, 1, -1
 
 

@@ -8,17 +8,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Bool, Float
 
-__all__ = [
-    "DONT_CARE",
-    "KITTI_TYPES",
-    "NO_BOX3D",
-    "Objects",
-    "concatenate",
-    "empty",
-    "points_inside",
-    "select",
-]
-
 KITTI_TYPES = (
     "Car",
     "Van",

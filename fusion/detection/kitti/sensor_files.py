@@ -9,8 +9,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["read_image", "read_points", "write_image", "write_points"]
-
 _FARTHEST = 500.0  # [m]; lidars reach 300
 _BRIGHTEST = 255.0  # reflectance; 1 in the benchmark
 # Image sizes of the benchmark lie between 1224x370 and 1242x376; resized copies are a common trap,

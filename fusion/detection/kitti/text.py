@@ -7,8 +7,6 @@ from pathlib import Path
 
 import numpy as np
 
-__all__ = ["parse_number", "read_lines"]
-
 
 def read_lines(path: Path) -> list[str]:
     """The lines of an ASCII file; a byte-order mark before them, as editors leave it, is skipped.

@@ -23,17 +23,6 @@ from fusion.detection.kitti.files import frame_names, read_frame, read_labels, r
 from fusion.detection.learning.examples import Example, make_example
 from fusion.detection.presets import preset
 
-__all__ = [
-    "TESTING",
-    "Cache",
-    "frame_part",
-    "open_cache",
-    "prepare_cache",
-    "read_example",
-    "split_frames",
-    "write_example",
-]
-
 TESTING = "testing"
 """The split of all frames in `ROOT/testing`, which have no labels; not a list of `ImageSets`."""
 

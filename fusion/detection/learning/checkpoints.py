@@ -5,8 +5,6 @@ from __future__ import annotations
 from pathlib import Path
 from typing import Any
 
-__all__ = ["Checkpoints"]
-
 
 class Checkpoints:
     """A folder of checkpoints, of which the newest two are kept."""

@@ -32,8 +32,6 @@ from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import Detections
 from fusion.gating import drop_modalities
 
-__all__ = ["dense_detect", "dense_loss", "grid_losses"]
-
 
 def _per_frame(values: Array, counted: Array) -> Array:
     """Mean over the cells that count, of every frame; 0 where there is none."""

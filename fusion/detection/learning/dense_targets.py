@@ -22,8 +22,6 @@ from jaxtyping import Array, Bool, Float
 from fusion.detection.config import DetectorConfig
 from fusion.detection.network.lifting import grid_centres
 
-__all__ = ["GridTargets", "decode_cells", "grid_targets"]
-
 _LOG_LIMIT = 1.0  # sizes as factors of the mean, e to this at most
 
 

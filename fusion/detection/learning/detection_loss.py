@@ -19,8 +19,6 @@ from jaxtyping import Array, Float
 from fusion.detection.learning.sampling import Sample
 from fusion.losses import cross_entropy
 
-__all__ = ["StageLoss", "balanced_class_loss", "class_loss", "regression_loss", "smooth_l1"]
-
 
 class StageLoss(NamedTuple):
     """Loss of the classes, of the boxes and of the headings (0 in the first stage)."""

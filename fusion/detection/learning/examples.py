@@ -23,8 +23,6 @@ from fusion.detection.kitti.files import Frame
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.sensors.depth import depth_image
 
-__all__ = ["Example", "flip", "frame_depth", "make_example", "make_inputs", "stack_examples"]
-
 MEAN_RGB = (92.84 / 255, 97.80 / 255, 93.58 / 255)  # of the training images (AVOD)
 
 

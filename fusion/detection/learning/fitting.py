@@ -35,15 +35,6 @@ from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import Detections
 from fusion.loop import TrainingDiverged
 
-__all__ = [
-    "DetectorFit",
-    "fit_detector",
-    "frame_order",
-    "restore_detector",
-    "run_detector",
-    "sensor_mask",
-]
-
 
 class DetectorFit(NamedTuple):
     """The trained state and a row of means every `report_every` steps."""

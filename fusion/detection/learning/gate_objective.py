@@ -36,8 +36,6 @@ from fusion.detection.learning.sampling import Sample
 from fusion.losses import LossParams, gate_penalty
 from fusion.targets import apply_targets
 
-__all__ = ["PathLosses", "class_losses", "failure_loss", "gate_terms", "path_losses"]
-
 
 class PathLosses(NamedTuple):
     """Losses of the views' paths in one stage.

@@ -15,8 +15,6 @@ from fusion.detection.network.forward import encode, propose_boxes, score_propos
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import Detections, decode_second, final_boxes
 
-__all__ = ["detect", "to_objects"]
-
 
 def detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Detections:
     """Both stages on a batch of frames, inside jit.

@@ -48,8 +48,6 @@ from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import anchor_boxes
 from fusion.gating import drop_modalities
 
-__all__ = ["DetectorLoss", "detector_loss"]
-
 _JITTER_PLACE, _JITTER_SIZE = 0.1, 0.05  # of copies of labels among the proposals
 
 

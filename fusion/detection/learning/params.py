@@ -10,8 +10,6 @@ from jaxtyping import Array, Float
 
 from fusion.losses import LossParams
 
-__all__ = ["DetectorParams"]
-
 Number = float | Float[Array, ""]
 
 

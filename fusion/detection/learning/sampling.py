@@ -13,8 +13,6 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from fusion.detection.geometry.suppression import pairwise
 
-__all__ = ["Assignment", "Sample", "assign", "draw"]
-
 
 class Assignment(NamedTuple):
     """Of each box: is it positive, is it negative (or neither), and the label it overlaps most."""

@@ -15,15 +15,6 @@ from fusion.detection.learning.inference import to_objects
 from fusion.detection.network.proposals import Detections
 from fusion.evaluate import auroc
 
-__all__ = [
-    "Camera",
-    "car_precision",
-    "frame_objects",
-    "image_scale",
-    "precision_fields",
-    "weight_auroc",
-]
-
 _KITTI_WIDTH, _NARROWEST = 1242.0, 1000.0
 
 

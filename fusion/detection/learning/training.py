@@ -32,17 +32,6 @@ from fusion.detection.sensors.lidar_failures import (
 )
 from fusion.targets import project_targets
 
-__all__ = [
-    "SENSOR_FAILURES",
-    "DetectorState",
-    "DetectorTrainConfig",
-    "fail_sensor",
-    "init_training",
-    "learning_rate",
-    "train_step",
-    "training_inputs",
-]
-
 SENSOR_FAILURES: tuple[str, ...] = (
     *(f"camera_{kind}" for kind in CAMERA_FAILURES),
     *(f"lidar_{kind}" for kind in LIDAR_FAILURES),

@@ -11,8 +11,6 @@ from fusion.detection.config import DetectorConfig
 from fusion.detection.network.dense import init_dense
 from fusion.detection.network.detector import init_avod
 
-__all__ = ["count_main_parameters", "init_detector"]
-
 
 def init_detector(key: PRNGKeyArray, config: DetectorConfig) -> tuple[Any, Any]:
     """Fresh parameters and the statistics of batch norm (empty with group norm).

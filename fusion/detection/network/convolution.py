@@ -20,8 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = ["convolve"]
-
 _WIDE = 32  # channels from which on the plain convolution is as fast
 
 

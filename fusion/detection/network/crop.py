@@ -9,8 +9,6 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["crop_and_resize"]
-
 
 def _samples(low: Array, high: Array, size: int, length: int) -> Array:
     """`[n, size]` positions along one axis, in pixels."""

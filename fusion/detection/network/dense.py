@@ -30,8 +30,6 @@ from fusion.detection.network.lifting import lift
 from fusion.detection.sensors.quality import quality_statistics
 from fusion.targets import init_targets
 
-__all__ = ["N_OUTPUTS", "DenseAuxiliary", "DenseDetector", "Grids", "init_dense"]
-
 N_OUTPUTS = 9  # heat; x, z, height from the ground; log length, width, height; cos, sin of heading
 _RARE = -4.0  # log odds of a centre to begin with
 _OUTPUTS = {"fusion": 0.0, "failed": 0.01, "boxes": 0.01}

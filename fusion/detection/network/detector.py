@@ -22,16 +22,6 @@ from fusion.detection.network.views import FeaturePyramid
 from fusion.detection.sensors.quality import quality_statistics
 from fusion.targets import init_targets
 
-__all__ = [
-    "AuxiliaryHeads",
-    "Detector",
-    "Encoded",
-    "crop_views",
-    "fuse",
-    "init_avod",
-    "teach_if_alive",
-]
-
 SENSORS = ("camera", "lidar")
 # Output layers start small: even class scores, boxes at their anchors. The gate's starts at zero,
 # so that training starts from equal weights, as AVOD fuses.

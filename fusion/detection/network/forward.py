@@ -21,8 +21,6 @@ from fusion.detection.network.detector import Detector, Encoded, crop_views, fus
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import propose, view_boxes
 
-__all__ = ["Scored", "encode", "propose_boxes", "score_anchors", "score_proposals"]
-
 
 class Scored(NamedTuple):
     """A stage's outputs on the fused crops, and the crops of both views.

@@ -17,8 +17,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-__all__ = ["GROUP_SIZE", "group_norm_relu"]
-
 GROUP_SIZE = 4  # channels normalized together
 _EPSILON = 1e-3
 

@@ -9,8 +9,6 @@ from jaxtyping import Array, Float
 
 from fusion.gating import Normalizer, normalize
 
-__all__ = ["GridGate", "MapGate", "QualityHead", "RpnHead", "SecondHead"]
-
 _LEAK = 0.1
 
 

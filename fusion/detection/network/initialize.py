@@ -20,8 +20,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
-__all__ = ["init_weights"]
-
 
 def _name(path: Any) -> tuple[str, ...]:
     return tuple(str(getattr(entry, "key", entry)) for entry in path)

@@ -6,8 +6,6 @@ from typing import NamedTuple
 
 from jaxtyping import Array
 
-__all__ = ["Inputs"]
-
 
 class Inputs(NamedTuple):
     """One frame, or with a leading axis a batch.

@@ -17,8 +17,6 @@ from jaxtyping import Array, Float
 
 from fusion.detection.config import DetectorConfig
 
-__all__ = ["grid_centres", "lift"]
-
 
 def grid_centres(config: DetectorConfig) -> tuple[np.ndarray, np.ndarray]:
     """x and z of the cells `[rows, columns]` [m]; row 0 is the farthest, as in the map."""

@@ -25,8 +25,6 @@ from fusion.detection.geometry.encodings import (
 )
 from fusion.detection.geometry.suppression import nms
 
-__all__ = ["Detections", "anchor_boxes", "decode_second", "final_boxes", "propose", "view_boxes"]
-
 # Sizes that training can ask of a proposal, as factors of its anchor; keeps exp() finite.
 _LOG_LIMIT = 1.5
 

@@ -14,8 +14,6 @@ from jaxtyping import Array, Float
 from fusion.detection.network.convolution import convolve
 from fusion.detection.network.group_norm import group_norm_relu
 
-__all__ = ["FeaturePyramid", "TransposedConv"]
-
 
 class _Conv(nn.Module):
     """3x3 convolution without bias, zeros around the map."""

@@ -37,8 +37,6 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from fusion.detection.sensors.severity import Severity, check_failure
 
-__all__ = ["CAMERA_FAILURES", "CameraFailure", "camera_failure", "random_camera_failure"]
-
 CameraFailure = Literal["noise", "blackout", "blur", "fog", "exposure"]
 CAMERA_FAILURES: tuple[CameraFailure, ...] = get_args(CameraFailure)
 

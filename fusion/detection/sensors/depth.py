@@ -10,8 +10,6 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
-__all__ = ["FARTHEST", "depth_image"]
-
 FARTHEST = 200.0  # [m], of what no ray of the road meets
 _REACH = (0.035, 0.01)  # half sides of the patch of a point, as shares of rows and columns
 

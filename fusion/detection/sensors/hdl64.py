@@ -14,8 +14,6 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-__all__ = ["AZIMUTH_STEP", "ELEVATIONS", "N_BEAMS", "RANGE_NOISE", "beam_of"]
-
 N_BEAMS = 64
 ELEVATIONS = np.radians(
     np.concatenate([2.0 - np.arange(32) / 3.0, -8.83 - np.arange(32) / 2.0])

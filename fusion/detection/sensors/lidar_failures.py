@@ -30,8 +30,6 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from fusion.detection.sensors.hdl64 import N_BEAMS, beam_of
 from fusion.detection.sensors.severity import Severity, check_failure
 
-__all__ = ["LIDAR_FAILURES", "LidarFailure", "lidar_failure", "random_lidar_failure"]
-
 LidarFailure = Literal["noise", "beam_loss", "sector_dropout", "loss"]
 LIDAR_FAILURES: tuple[LidarFailure, ...] = get_args(LidarFailure)
 

@@ -18,8 +18,6 @@ from jaxtyping import Array, Float
 
 from fusion.detection.geometry.bev import BevConfig
 
-__all__ = ["N_IMAGE", "N_SCAN", "image_statistics", "quality_statistics", "scan_statistics"]
-
 _LEVELS = np.linspace(-0.4, 0.6, 9, dtype=np.float32)  # of grey, mean colour subtracted
 _BLOCKS = 8  # rows and columns of blocks
 _SECTORS, _BANDS = 8, 6

@@ -7,8 +7,6 @@ from collections.abc import Sequence
 import numpy as np
 from jaxtyping import Array, Float
 
-__all__ = ["Severity", "check_failure"]
-
 Severity = Float[Array, ""] | float | int
 
 

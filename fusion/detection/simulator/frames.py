@@ -34,15 +34,6 @@ from fusion.detection.simulator.rendering import (
 )
 from fusion.detection.simulator.scene import Scene, SceneConfig, build_scene
 
-__all__ = [
-    "VISIBILITY_COLUMNS",
-    "SimulatedFrame",
-    "draw_scene",
-    "simulate_frames",
-    "split_layouts",
-    "write_frame",
-]
-
 VISIBILITY_COLUMNS = (
     "label", "kind", "points", "pixels", "share", "dark_paint", "low_contrast", "night",
     "x", "y", "z", "length", "width", "height", "rotation_y",

@@ -11,8 +11,6 @@ from fusion.detection.kitti.objects import Objects
 from fusion.detection.simulator.rendering import Readings
 from fusion.detection.simulator.scene import KINDS, LABELLED, Scene
 
-__all__ = ["Visibility", "image_boxes", "labels_of", "visibility_of"]
-
 PARTLY, LARGELY, HARDLY = 0.9, 0.5, 0.1  # visible share below which occlusion is 1, 2, 3
 DARK = 0.05  # reflectivity of dark paint lies below this
 _NEAR = 0.1  # [m]

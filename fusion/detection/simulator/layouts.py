@@ -21,8 +21,6 @@ from fusion.detection.geometry.overlaps import rotated_intersection
 from fusion.detection.kitti.files import frame_names, read_labels
 from fusion.detection.kitti.objects import DONT_CARE, KITTI_TYPES, NO_BOX3D
 
-__all__ = ["Layout", "compose", "generated_layout", "keep_apart", "read_layouts"]
-
 MAX_DEPTH = 75.0  # [m], a little over the area that detectors look at
 MAX_SIDE = 40.0  # [m]
 

@@ -14,8 +14,6 @@ from jaxtyping import Array, Float, Int
 from fusion.detection.simulator.raycast import GROUND, SKY, Hits, to_body
 from fusion.detection.simulator.scene import KINDS, Scene
 
-__all__ = ["Surface", "surfaces"]
-
 _OF = {name: i for i, name in enumerate(KINDS)}
 GLASS = (0.13, 0.16, 0.20)
 TYRE = (0.06, 0.06, 0.07)

@@ -13,8 +13,6 @@ from fusion.detection.kitti.calibration import lidar_to_camera
 from fusion.detection.kitti.files import Frame
 from fusion.detection.kitti.objects import DONT_CARE, Objects
 
-__all__ = ["plot_frames"]
-
 COLOURS = {"Car": "#e69f00", "Van": "#56b4e9", "Truck": "#56b4e9"}
 OTHER = "#cc79a7"
 SIDE, AHEAD = 30.0, 70.0  # [m], of the bird's-eye view

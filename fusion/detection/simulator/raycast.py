@@ -22,8 +22,6 @@ from jaxtyping import Array, Float
 
 from fusion.detection.simulator.scene import Scene
 
-__all__ = ["GROUND", "SKY", "Hits", "cast"]
-
 GROUND, SKY = -1, -2  # what a ray met when it met no body
 
 

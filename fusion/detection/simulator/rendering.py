@@ -32,8 +32,6 @@ from fusion.detection.simulator.materials import surfaces
 from fusion.detection.simulator.raycast import cast
 from fusion.detection.simulator.scene import Scene
 
-__all__ = ["SIZES", "Rays", "Readings", "SensorConfig", "nominal_calibration", "rays", "render"]
-
 DIFFUSE, RETRO = 0.773, 0.339  # Oren-Nayar A and B at a roughness of 30 degrees
 THRESHOLD = 0.1 * DIFFUSE / 50.0**2
 GLASS_SHARE = 0.25

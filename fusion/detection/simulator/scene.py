@@ -17,8 +17,6 @@ from fusion.detection.geometry.overlaps import rotated_intersection
 from fusion.detection.geometry.planes import plane_y
 from fusion.detection.simulator.layouts import Layout
 
-__all__ = ["KINDS", "LABELLED", "Scene", "SceneConfig", "build_scene"]
-
 KINDS = (
     "Car", "Van", "Truck", "Pedestrian", "Person_sitting", "Cyclist", "Tram", "Misc",
     "bush", "container", "building", "tree", "pole", "nothing",

@@ -20,8 +20,6 @@ from fusion.presets import preset as named_preset
 from fusion.train import init_state, make_epoch, make_train, predict_batches
 from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
-__all__ = ["make"]
-
 
 def make(
     dataset: str = "simulated",

@@ -20,8 +20,6 @@ from failure.models import acquisition, gp, gp_fit
 from failure.models.optimize import Domain, box, sample
 from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
-__all__ = ["SearchParams", "make"]
-
 
 class SearchParams(NamedTuple):
     """Leaves of the search."""

@@ -15,8 +15,6 @@ import jax.numpy as jnp
 from jaxsnn.neurons import LIFParams, check_lif, lif_init, lif_step
 from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
-__all__ = ["LIFStudy", "make"]
-
 _UNITS = {
     "neuron.tau_m": "ms", "neuron.t_ref": "ms", "neuron.v_rest": "mV", "neuron.v_reset": "mV",
     "neuron.v_th": "mV", "target": "Hz",

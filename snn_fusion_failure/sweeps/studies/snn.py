@@ -22,8 +22,6 @@ from jaxsnn.trials import TrialResult
 from snn_fusion_failure.runs.networks import changed_preset
 from snn_fusion_failure.sweeps.study import Metric, Study
 
-__all__ = ["make"]
-
 _TIMES = ("tau_m", "t_ref", "tau_plus", "tau_minus", "tau_z")
 _MILLIVOLTS = ("v_rest", "v_reset", "v_th", "w_max", "w_max_low", "w_min", "a_plus", "a_minus")
 

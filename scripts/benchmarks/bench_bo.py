@@ -25,6 +25,8 @@ from functools import partial
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.runs import provenance, run_command, write_json
+
 for _name in ("OMP_NUM_THREADS", "MKL_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
     os.environ.setdefault(_name, "1")
 os.environ.setdefault(
@@ -211,8 +213,6 @@ def compare(seed: int, config: Config, dim: int) -> dict[str, Any]:
 
 def main(config: Config) -> dict[str, Any]:
     """Run all cases; returns them with the medians."""
-    from snn_fusion_failure.runs import print_result, provenance, write_json
-
     cases = []
     for dim in config.dims:
         for repeat in range(config.repeats):
@@ -245,11 +245,13 @@ def main(config: Config) -> dict[str, Any]:
     result = {**provenance(), "summary": summary, "cases": cases}
     if config.out is not None:
         write_json(config.out / "bench_bo.json", result)
-    print_result(**summary)
     return result
 
 
-if __name__ == "__main__":
-    import tyro
+def fields(result: dict[str, Any]) -> dict[str, float]:
+    """What the result line says."""
+    return result["summary"]
 
-    main(tyro.cli(Config, description=__doc__))
+
+if __name__ == "__main__":
+    run_command(Config, main, description=__doc__, fields=fields)

@@ -17,6 +17,13 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.runs import (
+    enable_compilation_cache,
+    provenance,
+    run_command,
+    write_json,
+)
+
 
 @dataclass(frozen=True)
 class Config:
@@ -75,19 +82,14 @@ def main(config: Config) -> dict[str, Any]:
     return result
 
 
-if __name__ == "__main__":
-    import tyro
-
-    from snn_fusion_failure.runs import (
-        enable_compilation_cache,
-        print_result,
-        provenance,
-        write_json,
-    )
-
-    config = tyro.cli(Config, description=__doc__)
+def record(config: Config) -> dict[str, Any]:
+    """Write what `main` finds; returns what the result line says."""
     enable_compilation_cache()
     result = main(config)
     if config.out is not None:
         write_json(config.out, {"benchmark": "circuits", **provenance(), **result})
-    print_result(**{k: v for k, v in result.items() if not isinstance(v, list)})
+    return {name: value for name, value in result.items() if not isinstance(value, list)}
+
+
+if __name__ == "__main__":
+    run_command(Config, record, description=__doc__, fields=dict)

@@ -18,11 +18,9 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.commands.detector_options import ModelOption, SizeOption
 from snn_fusion_failure.records.rows import record_table, summarize
-from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
+from snn_fusion_failure.runs import enable_compilation_cache, print_result, repository, run_command
 
 
 @dataclasses.dataclass(frozen=True)
@@ -159,7 +157,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

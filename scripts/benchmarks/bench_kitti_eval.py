@@ -18,7 +18,7 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.records.rows import summarize
-from snn_fusion_failure.runs import fail, print_result, provenance, repository, write_json
+from snn_fusion_failure.runs import provenance, repository, run_command, write_json
 
 TARGET_S = 60.0
 """Reading and evaluating 3,769 frames must not take longer, on two cores."""
@@ -127,18 +127,11 @@ def main(config: Config) -> dict[str, Any]:
     return record
 
 
-if __name__ == "__main__":
-    import tyro
+def fields(done: dict[str, Any]) -> dict[str, Any]:
+    """What the result line says."""
+    shown = ("frames", "detections", "read_s", "target_s")
+    return {**{name: done[name] for name in shown}, "evaluate_s": done["evaluate_s"]["mean"]}
 
-    options = tyro.cli(Config, description=__doc__)
-    try:
-        done = main(options)
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
-    print_result(
-        frames=done["frames"],
-        detections=done["detections"],
-        evaluate_s=done["evaluate_s"]["mean"],
-        read_s=done["read_s"],
-        target_s=done["target_s"],
-    )
+
+if __name__ == "__main__":
+    run_command(Config, main, description=__doc__, fields=fields)

@@ -26,9 +26,9 @@ from typing import Any, Literal
 
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    print_result,
     provenance,
     repository,
+    run_command,
     write_json,
 )
 
@@ -283,6 +283,4 @@ def _fields(result: dict[str, Any]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    print_result(**_fields(main(tyro.cli(Config, description=__doc__))))
+    run_command(Config, main, description=__doc__, fields=_fields)

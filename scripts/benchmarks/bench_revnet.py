@@ -14,7 +14,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.runs import print_result, provenance, repository, write_json
+from snn_fusion_failure.runs import provenance, repository, run_command, write_json
 
 
 @dataclass(frozen=True)
@@ -87,13 +87,15 @@ def main(config: Config) -> dict[str, Any]:
     return result
 
 
-if __name__ == "__main__":
-    import tyro
+def fields(found: dict[str, Any]) -> dict[str, float]:
+    """What the result line says."""
+    return {
+        "ratio": found["recomputed"]["ratio"],
+        "ratio_stored": found["stored"]["ratio"],
+        "inverse_float32": found["inverse_error"]["float32"],
+        "inverse_float64": found["inverse_error"]["float64"],
+    }
 
-    found = main(tyro.cli(Config, description=__doc__))
-    print_result(
-        ratio=found["recomputed"]["ratio"],
-        ratio_stored=found["stored"]["ratio"],
-        inverse_float32=found["inverse_error"]["float32"],
-        inverse_float64=found["inverse_error"]["float64"],
-    )
+
+if __name__ == "__main__":
+    run_command(Config, main, description=__doc__, fields=fields)

@@ -20,14 +20,11 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    fail,
-    print_result,
     provenance,
     repository,
+    run_command,
     write_json,
 )
 
@@ -304,16 +301,11 @@ def main(bench: Bench) -> dict[str, Any]:
     return out
 
 
-def run_cli() -> None:
-    """Parse, run, print the result line."""
-    bench = tyro.cli(Bench, description=__doc__)
-    try:
-        out = main(bench)
-    except ValueError as error:
-        fail(str(error))
-    fields = {f"robot_ms_per_s_{n}": v for n, v in out["window"].items()}
-    print_result(gemm_gflops=out["gemm_peak_gflops"], **fields)
+def fields(out: dict[str, Any]) -> dict[str, float]:
+    """What the result line says."""
+    speeds = {f"robot_ms_per_s_{n}": v for n, v in out["window"].items()}
+    return {"gemm_gflops": out["gemm_peak_gflops"], **speeds}
 
 
 if __name__ == "__main__":
-    run_cli()
+    run_command(Bench, main, description=__doc__, fields=fields)

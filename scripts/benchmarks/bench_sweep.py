@@ -19,13 +19,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    print_result,
     provenance,
     repository,
+    run_command,
     write_json,
 )
 from snn_fusion_failure.sweeps.capacity import chunk_costs, writer_rates
@@ -120,9 +118,8 @@ def main(config: Config) -> dict[str, Any]:
     return result
 
 
-def run_cli() -> None:
-    """Parse, run, print the result line."""
-    result = main(tyro.cli(Config, description=__doc__))
+def fields(result: dict[str, Any]) -> dict[str, float]:
+    """What the result line says, below a line for each simulated crowd."""
     for row in result["simulated"]:
         way = "pulled" if row["pull"] else "shards"
         print(
@@ -130,14 +127,13 @@ def run_cli() -> None:
             f"{row['efficiency']:.3f}, wait {1e3 * row['wait_s']:.1f} ms"
         )
     times = result["sweep_by_workers"]
-    fields = {f"wall_{k}": v["wall_s"] for k, v in times.items()}
-    print_result(
-        write_ms=result["chunk"]["16 trials"]["write_ms"],
-        files_per_second=1.0 / result["file_s"],
-        saturate_10s=result["workers_that_saturate_the_folder"]["10 s"],
-        **fields,
-    )
+    return {
+        "write_ms": result["chunk"]["16 trials"]["write_ms"],
+        "files_per_second": 1.0 / result["file_s"],
+        "saturate_10s": result["workers_that_saturate_the_folder"]["10 s"],
+        **{f"wall_{k}": v["wall_s"] for k, v in times.items()},
+    }
 
 
 if __name__ == "__main__":
-    run_cli()
+    run_command(Config, main, description=__doc__, fields=fields)

@@ -23,9 +23,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
-import tyro
-
-from snn_fusion_failure.runs import print_result, provenance, repository, write_json
+from snn_fusion_failure.runs import provenance, repository, run_command, write_json
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,9 +260,13 @@ def main(config: Config) -> dict[str, Any]:
     return found
 
 
+def fields(results: dict[str, Any]) -> dict[str, int]:
+    """What the result line says."""
+    return {"done": sum("missing" not in r for r in results.values()), "of": len(results)}
+
+
 if __name__ == "__main__":
     if sys.argv[1:2] == ["--part"]:
         part_main(sys.argv[2], Path(sys.argv[3]), sys.argv[4] == "1")
     else:
-        results = main(tyro.cli(Config, description=__doc__))
-        print_result(done=sum("missing" not in r for r in results.values()), of=len(results))
+        run_command(Config, main, description=__doc__, fields=fields)

@@ -18,10 +18,8 @@ import json
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.records.rows import record_comparisons, record_table
-from snn_fusion_failure.runs import fail, print_result, repository
+from snn_fusion_failure.runs import repository, run_command
 
 PAIRS = (("S2", "S1"), ("S4", "S3"), ("S3", "S1"), ("S4", "S2"))
 
@@ -94,9 +92,10 @@ def main(config: Compare) -> dict[str, int]:
     return written
 
 
+def fields(done: dict[str, int]) -> dict[str, int]:
+    """What the result line says."""
+    return {"comparisons": sum(done.values()), "tables": len(done)}
+
+
 if __name__ == "__main__":
-    try:
-        done = main(tyro.cli(Compare, description=__doc__))
-    except ValueError as error:
-        fail(str(error))
-    print_result(comparisons=sum(done.values()), tables=len(done))
+    run_command(Compare, main, description=__doc__, fields=fields)

@@ -14,9 +14,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-import tyro
-
-from snn_fusion_failure.runs import enable_compilation_cache, print_result, progress
+from snn_fusion_failure.runs import enable_compilation_cache, progress, run_command
 
 PHASES = {"learning": 0, "testing": 1}
 
@@ -181,6 +179,10 @@ def main(config: Figures) -> dict[str, Any]:
     return {"out": str(config.out), "curves": curves}
 
 
+def fields(found: dict[str, Any]) -> dict[str, Any]:
+    """What the result line says."""
+    return {"out": found["out"], "learning_curves": sum(found["curves"].values())}
+
+
 if __name__ == "__main__":
-    found = main(tyro.cli(Figures, description=__doc__))
-    print_result(out=found["out"], learning_curves=sum(found["curves"].values()))
+    run_command(Figures, main, description=__doc__, fields=fields)

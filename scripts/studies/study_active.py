@@ -19,10 +19,10 @@ from typing import Any
 
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    fail,
     print_result,
     provenance,
     repository,
+    run_command,
     write_json,
 )
 
@@ -136,6 +136,7 @@ def main(config: Config) -> dict[str, Any]:
     """Study the specifications of one circuit; returns their rows."""
     from failure import circuits
 
+    enable_compilation_cache()
     circuit = circuits.get(config.circuit)
     names = config.specs or circuit.spec_names
     path = config.record
@@ -149,22 +150,15 @@ def main(config: Config) -> dict[str, Any]:
         same = (row["circuit"], row["spec"])
         held = [r for r in held if (r["circuit"], r["spec"]) != same] + [row]
         write_json(path, {"study": "active", "rows": held})
+        print_result(
+            spec=row["spec"],
+            active=f"{row['n_active_half']}/{row['n_features']}",
+            rmse_active=row["rmse_active_only"],
+            rmse_all=row["rmse_all"],
+            first=next(iter(row["transistors"])),
+        )
     return {"rows": rows}
 
 
 if __name__ == "__main__":
-    import tyro
-
-    try:
-        config = tyro.cli(Config, description=__doc__)
-        enable_compilation_cache()
-        for row in main(config)["rows"]:
-            print_result(
-                spec=row["spec"],
-                active=f"{row['n_active_half']}/{row['n_features']}",
-                rmse_active=row["rmse_active_only"],
-                rmse_all=row["rmse_all"],
-                first=next(iter(row["transistors"])),
-            )
-    except ValueError as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

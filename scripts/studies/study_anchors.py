@@ -15,11 +15,9 @@ import dataclasses
 from pathlib import Path
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.commands.detector_options import SizeOption
 from snn_fusion_failure.records.rows import record_table, summarize
-from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
+from snn_fusion_failure.runs import enable_compilation_cache, print_result, repository, run_command
 
 TITLE = "Cars that keep an anchor when the lidar fails"
 OVERLAP = 0.5
@@ -97,7 +95,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

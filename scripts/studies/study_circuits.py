@@ -10,10 +10,18 @@ under the uniform distribution. Writes `results/study_circuits.json`. About 5 CP
 
 from __future__ import annotations
 
+import json
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
+
+from snn_fusion_failure.runs import (
+    enable_compilation_cache,
+    provenance,
+    run_command,
+    write_json,
+)
 
 
 @dataclass(frozen=True)
@@ -156,19 +164,8 @@ def main(config: Config) -> dict[str, Any]:
     }
 
 
-if __name__ == "__main__":
-    import json
-
-    import tyro
-
-    from snn_fusion_failure.runs import (
-        enable_compilation_cache,
-        print_result,
-        provenance,
-        write_json,
-    )
-
-    config = tyro.cli(Config, description=__doc__)
+def record(config: Config) -> dict[str, Any]:
+    """Put what `main` finds beside the circuits on record; returns what the result line says."""
     enable_compilation_cache()
     part = main(config)
     held: dict[str, Any] = {}
@@ -176,5 +173,8 @@ if __name__ == "__main__":
         held = json.loads(config.out.read_text(encoding="utf-8"))["circuits"]
     held[part["circuit"]] = {**part, **provenance()}
     write_json(config.out, {"study": "circuits", "circuits": held})
-    summary = {r["spec"]: r["box"]["threshold"] for r in part["rows"]}
-    print_result(circuit=part["circuit"], **summary)
+    return {"circuit": part["circuit"], **{r["spec"]: r["box"]["threshold"] for r in part["rows"]}}
+
+
+if __name__ == "__main__":
+    run_command(Config, record, description=__doc__, fields=dict)

@@ -25,12 +25,10 @@ import json
 from pathlib import Path
 from typing import Any, Literal
 
-import tyro
-
 from snn_fusion_failure.commands import detector_options as choices
 from snn_fusion_failure.commands import detector_runs as runs
 from snn_fusion_failure.records.rows import record_table, summarize
-from snn_fusion_failure.runs import fail, print_result, repository
+from snn_fusion_failure.runs import print_result, repository, run_command
 
 MODELS: tuple[choices.Model, ...] = ("avod", "avod_argate")
 METRICS = (
@@ -242,7 +240,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

@@ -22,16 +22,8 @@ import json
 import time
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.records.rows import record_table, summarize
-from snn_fusion_failure.runs import (
-    enable_compilation_cache,
-    fail,
-    print_result,
-    progress,
-    repository,
-)
+from snn_fusion_failure.runs import enable_compilation_cache, progress, repository, run_command
 from snn_fusion_failure.runs.origin import check_recordable
 
 ROWS = ("Scenario 1", "Scenario 2", "Scenario 3", "D1", "D2", "D3", "held-out detour family")
@@ -266,9 +258,10 @@ def main(config: Study) -> dict[str, float]:
     return found
 
 
+def fields(done: dict[str, float]) -> dict[str, Any]:
+    """What the result line says."""
+    return {"cells": len(done), "file": "results/study_detour.json"}
+
+
 if __name__ == "__main__":
-    try:
-        done = main(tyro.cli(Study, description=__doc__))
-    except ValueError as error:
-        fail(str(error))
-    print_result(cells=len(done), file="results/study_detour.json")
+    run_command(Study, main, description=__doc__, fields=fields)

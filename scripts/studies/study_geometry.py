@@ -26,7 +26,6 @@ from typing import Any, NamedTuple
 
 import jax.numpy as jnp
 import numpy as np
-import tyro
 from jaxtyping import Float
 
 from fusion.detection.geometry.encodings import box_corners
@@ -42,7 +41,7 @@ from fusion.detection.kitti.calibration import (
 from fusion.detection.kitti.files import Frame, frame_names, read_frame
 from fusion.detection.kitti.objects import Objects, points_inside, select
 from snn_fusion_failure.records.rows import record_table
-from snn_fusion_failure.runs import fail, print_result, progress, repository
+from snn_fusion_failure.runs import print_result, progress, repository, run_command
 
 MARGIN, CLEARANCE = 0.5, 0.3  # [m], around a car and above its bottom face
 TITLE = "Lidar, camera and labels of KITTI frames (real) and of simulated ones"
@@ -239,7 +238,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

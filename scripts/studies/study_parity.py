@@ -25,10 +25,9 @@ from typing import Any
 
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    fail,
-    print_result,
     provenance,
     repository,
+    run_command,
     write_json,
 )
 
@@ -227,7 +226,8 @@ def main(config: Config) -> dict[str, Any]:
 
     unknown = [p for p in config.parts if p not in PARTS]
     if unknown:
-        raise ValueError(f"unknown part {unknown[0]!r}; known: {', '.join(PARTS)}")
+        raise ValueError(f"parts={unknown[0]!r}: expected some of {', '.join(PARTS)}; choose")
+    enable_compilation_cache()
     held: dict[str, Any] = {}
     if config.out.exists():
         held = json.loads(config.out.read_text(encoding="utf-8"))["parts"]
@@ -256,11 +256,4 @@ def summary(held: dict[str, Any]) -> dict[str, float]:
 
 
 if __name__ == "__main__":
-    import tyro
-
-    try:
-        config = tyro.cli(Config, description=__doc__)
-        enable_compilation_cache()
-        print_result(**summary(main(config)))
-    except ValueError as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__, fields=summary)

@@ -19,7 +19,7 @@ from functools import partial
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from snn_fusion_failure.runs import print_result, progress, provenance, repository, write_json
+from snn_fusion_failure.runs import progress, provenance, repository, run_command, write_json
 
 DIM = 60
 
@@ -146,12 +146,14 @@ def main(config: Config) -> dict[str, Any]:
     return {"rows": rows}
 
 
-if __name__ == "__main__":
-    import tyro
-
-    found = main(tyro.cli(Config, description=__doc__))
+def summary(found: dict[str, Any]) -> dict[str, int]:
+    """Runs, and the least count of intervals that cover by estimator."""
     worst: dict[str, int] = {}
     for row in found["rows"]:
         name = row["estimator"].split(" ")[0]
         worst[name] = min(worst.get(name, row["runs"]), row["covered"])
-    print_result(runs=found["rows"][0]["runs"], **{f"least_{k}": v for k, v in worst.items()})
+    return {"runs": found["rows"][0]["runs"], **{f"least_{k}": v for k, v in worst.items()}}
+
+
+if __name__ == "__main__":
+    run_command(Config, main, description=__doc__, fields=summary)

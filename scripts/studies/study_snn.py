@@ -16,11 +16,10 @@ import json
 import time
 from typing import Annotated, Any, Literal
 
-import tyro
 from tyro.conf import arg
 
 from snn_fusion_failure.records.rows import record_table, summarize
-from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
+from snn_fusion_failure.runs import enable_compilation_cache, repository, run_command
 from snn_fusion_failure.runs.networks import changed_preset
 
 TITLE = "Variants of a network around a setting"
@@ -153,16 +152,11 @@ def main(config: Study) -> dict[str, Any]:
     return done
 
 
-def run_cli() -> None:
-    """Parse, run, print the result line."""
-    config = tyro.cli(Study, description=__doc__)
-    try:
-        done = main(config)
-    except ValueError as error:
-        fail(str(error))
+def fields(done: dict[str, float]) -> dict[str, Any]:
+    """What the result line says."""
     best = max(done, key=lambda name: done[name]) if done else "none"
-    print_result(variants=len(done), best=best.replace(" ", "_"))
+    return {"variants": len(done), "best": best.replace(" ", "_")}
 
 
 if __name__ == "__main__":
-    run_cli()
+    run_command(Study, main, description=__doc__, fields=fields)

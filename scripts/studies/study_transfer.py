@@ -20,16 +20,15 @@ from __future__ import annotations
 import dataclasses
 from typing import Annotated, Any, Literal
 
-import tyro
 from tyro.conf import arg
 
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    fail,
     print_result,
     progress,
     repository,
+    run_command,
 )
 
 CHECKPOINTS = (1, 2, 3, 5, 10, 20, 40)
@@ -206,20 +205,16 @@ def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
             }[config.study]
             preset = f"{config.seeds} robots"
             record_table(path, path.stem, title, rows, preset=preset)
+    print_result(**fields(config, found))
     return found
 
 
-def run_cli() -> None:
-    """Parse, run, print the result line."""
-    config = tyro.cli(Transfer, description=__doc__)
-    try:
-        found = main(config)
-    except ValueError as error:
-        fail(str(error))
+def fields(config: Transfer, found: dict[int, dict[str, list[float]]]) -> dict[str, Any]:
+    """What the result line says."""
     name = shown_metric(config)
     rates = {f"scenario{s}": sum(v[name]) / len(v[name]) for s, v in found.items()}
-    print_result(study=config.study, metric=name, **rates)
+    return {"study": config.study, "metric": name, **rates}
 
 
 if __name__ == "__main__":
-    run_cli()
+    run_command(Transfer, main, description=__doc__)

@@ -27,7 +27,6 @@ from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
-import tyro
 from jaxtyping import Array, Float
 
 from fusion.detection.config import DetectorConfig
@@ -38,7 +37,7 @@ from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import view_boxes
 from fusion.evaluate import auroc
 from snn_fusion_failure.records.rows import record_table, summarize
-from snn_fusion_failure.runs import enable_compilation_cache, fail, print_result, repository
+from snn_fusion_failure.runs import enable_compilation_cache, print_result, repository, run_command
 
 LOOK_ALIKES = ("bush", "container")
 _BOX = ("x", "y", "z", "length", "width", "height", "rotation_y")
@@ -266,7 +265,4 @@ def main(config: Config) -> dict[str, Any]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except (ValueError, FileNotFoundError) as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

@@ -20,9 +20,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
-import tyro
-
-from snn_fusion_failure.runs import fail, print_result, repository
+from snn_fusion_failure.runs import print_result, repository, run_command
 
 PACKAGES = ("jaxsnn", "fusion", "failure", "snn_fusion_failure")
 
@@ -167,7 +165,4 @@ def main(config: Config) -> dict[str, int]:
 
 
 if __name__ == "__main__":
-    try:
-        main(tyro.cli(Config, description=__doc__))
-    except ValueError as error:
-        fail(str(error))
+    run_command(Config, main, description=__doc__)

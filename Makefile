@@ -3,6 +3,7 @@ PYTHON ?= python3
 VENV   ?= .venv
 BIN    := $(VENV)/bin
 JOBS   ?= 2
+NEWER  ?= python3.13
 # The versions that the suite has passed with; `make CONSTRAINTS= test` takes the newest there are.
 CONSTRAINTS ?= constraints.txt
 INSTALL := -m pip install -q --disable-pip-version-check $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
@@ -13,7 +14,7 @@ PART   ?= $(shell expr $$(date +%j) % 3)/3
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
 
-.PHONY: help demo report test slow commands lint types docs wheel lowest check clean
+.PHONY: help demo report test slow commands lint types docs wheel lowest newer check clean
 .DEFAULT_GOAL := help
 
 help:  ## list the commands
@@ -64,7 +65,10 @@ wheel: $(VENV)/.dev  ## build the wheel and import it from outside the repositor
 lowest: $(VENV)/.dev  ## a few test files with the lowest allowed versions, in an environment of their own
 	$(BIN)/python scripts/tools/check_lowest.py
 
-check: lint types docs wheel test slow commands lowest  ## everything; CI runs a part of commands and leaves slow and lowest out
+newer: $(VENV)/.dev  ## the same test files with a newer Python, in an environment of their own
+	$(BIN)/python scripts/tools/check_lowest.py --python $(NEWER) --versions constraints
+
+check: lint types docs wheel test slow commands lowest  ## everything; CI runs a part of commands and leaves slow, lowest and newer out
 
 clean:  ## remove what the other commands made, but not runs/ or results/
 	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

@@ -1,10 +1,12 @@
-"""Install the lowest allowed versions into an empty environment and run a few test files with them.
+"""Run a few test files in an empty environment with other versions than the suite has.
 
     python scripts/tools/check_lowest.py
     python scripts/tools/check_lowest.py --keep runs/lowest
+    python scripts/tools/check_lowest.py --python python3.13 --versions constraints
 
-The versions are the lower bounds of `pyproject.toml`. Takes a few minutes, mostly for installing
-and compiling; the test files touch each dependency once.
+The versions are the lower bounds of `pyproject.toml`, or those of `constraints.txt` for a look at
+another Python. Takes a few minutes, mostly for installing and compiling; the test files touch each
+dependency once.
 """
 
 from __future__ import annotations
@@ -12,12 +14,13 @@ from __future__ import annotations
 import dataclasses
 import os
 import re
+import shutil
 import subprocess
 import sys
 import tempfile
 import tomllib
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from snn_fusion_failure.runs import repository, run_command
 
@@ -41,6 +44,10 @@ class Config:
     """Test files to run."""
     keep: Path | None = None
     """Make the environment here and leave it."""
+    python: str = sys.executable
+    """The interpreter of the environment: a path or a name on the PATH, for example python3.13."""
+    versions: Literal["lowest", "constraints"] = "lowest"
+    """Lower bounds of pyproject.toml, or the versions of constraints.txt."""
 
 
 def lowest(project: dict[str, Any]) -> list[str]:
@@ -64,15 +71,24 @@ def lowest(project: dict[str, Any]) -> list[str]:
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Install and run; the status of the tests is that of the command."""
+    """Install and run; the status of the tests is that of the command.
+
+    Raises:
+        ValueError: the interpreter is not there, or a requirement has no lower bound.
+    """
+    interpreter = shutil.which(config.python)
+    if interpreter is None:
+        raise ValueError(f"python={config.python!r}: expected an interpreter; install it first")
     text = (repository.ROOT / "pyproject.toml").read_text(encoding="utf-8")
     pinned = lowest(tomllib.loads(text)["project"])
     with tempfile.TemporaryDirectory(prefix="lowest-") as temporary:
         folder = config.keep or Path(temporary)
         folder.mkdir(parents=True, exist_ok=True)
-        listed = folder / "lowest.txt"
-        listed.write_text("\n".join(pinned) + "\n", encoding="utf-8")
-        subprocess.run([sys.executable, "-m", "venv", str(folder / "venv")], check=True)
+        listed = repository.ROOT / "constraints.txt"
+        if config.versions == "lowest":
+            listed = folder / "lowest.txt"
+            listed.write_text("\n".join(pinned) + "\n", encoding="utf-8")
+        subprocess.run([interpreter, "-m", "venv", str(folder / "venv")], check=True)
         python = str(folder / "venv" / "bin" / "python")
         names = [pin.split("==")[0] for pin in pinned]
         pip = [python, "-m", "pip", "install", "-q", "--disable-pip-version-check"]

@@ -1,4 +1,4 @@
-"""What is promised: the packages whose names are public, their tasks, and what the page says of it."""
+"""What is promised: packages with public names, their tasks, and what the page says of it."""
 
 from __future__ import annotations
 

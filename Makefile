@@ -43,7 +43,7 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 	@echo "== running the default test suite on $(JOBS) workers"
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-slow: $(VENV)/.dev  ## a third of the tests that take minutes each, another third every day
+slow: $(VENV)/.dev  ## a third of the long tests, another third every day
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
 
 commands: $(VENV)/.dev  ## run every command of README and docs at its smallest size, in a copy

@@ -42,10 +42,15 @@ def blocks(page: Path) -> list[tuple[bool, str, int]]:
     ]
 
 
+# These train networks for half a minute each.
+LONG = ("argate_in_flax", "own_data", "brax_ppo", "lattice_in_flax")
+
+
 def with_marks(page: Path) -> Any:
     """brax warns about its optional engines, and about jax's deprecations, as it is imported."""
-    quiet = [pytest.mark.filterwarnings("ignore")] if "brax" in page.stem else []
-    return pytest.param(page, id=page.stem, marks=quiet)
+    marks = [pytest.mark.filterwarnings("ignore")] if "brax" in page.stem else []
+    marks += [pytest.mark.slow] if page.stem in LONG else []
+    return pytest.param(page, id=page.stem, marks=marks)
 
 
 @pytest.mark.relaxed

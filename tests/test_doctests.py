@@ -7,6 +7,7 @@ import doctest
 import importlib
 from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -41,7 +42,12 @@ def test_examples_are_found() -> None:
     assert sum(map(len, MODULES.values())) >= 40
 
 
-@pytest.mark.parametrize("name", MODULES)
+def with_marks(name: str) -> Any:
+    """`fusion.modules` trains a network of its reader's own encoders, which compiles for long."""
+    return pytest.param(name, marks=[pytest.mark.slow] if name == "fusion.modules" else [])
+
+
+@pytest.mark.parametrize("name", [with_marks(name) for name in MODULES])
 def test_examples_of_docstrings(name: str) -> None:
     module = importlib.import_module(name)
     runner = doctest.DocTestRunner(verbose=False)

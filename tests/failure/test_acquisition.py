@@ -73,6 +73,7 @@ def brute_force(config, posterior, value, n=200_000):
     return float(jnp.max(value(mean, jnp.sqrt(variance))))
 
 
+@pytest.mark.slow
 def test_ascent_beats_a_dense_random_search(surrogate):
     config, posterior, best = surrogate
     acq = acquisition.AcquisitionConfig(n_raw=64, n_restarts=4)

@@ -1,6 +1,7 @@
 import jax
 import jax.numpy as jnp
 import numpy as np
+import pytest
 
 from failure import active, plots, revnet
 from failure.rev_argate import RevArgateConfig, init
@@ -10,6 +11,7 @@ NAMES = [("M1", "length"), ("M1", "width"), ("M2", "length"), ("M2", "width"), (
          ("M3", "width")]  # fmt: skip
 
 
+@pytest.mark.slow
 def test_a_network_that_moves_nothing_points_at_its_own_parameter(tmp_path):
     """With K = 0 the features are the parameters, so the weights pass through unchanged."""
     config = RevArgateConfig(depth=2, feature_width=2, gate_width=4)

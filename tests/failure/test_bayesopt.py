@@ -49,6 +49,7 @@ def test_search_finds_the_maximum_that_random_sampling_misses(full_run):
     assert np.all(np.abs(full_run.x) <= 3.0)
 
 
+@pytest.mark.slow
 def test_seeds_side_by_side_equal_seeds_alone(full_run):
     alone = runs.run(config(seeds=(1,)), bowl)
     # rounding differs between the two programs, and a search amplifies it: the first points

@@ -143,6 +143,7 @@ def test_a_point_appended_is_a_point_conditioned_on(botorch_cases, kernel):
     chex.assert_trees_all_close(grown.alpha, full.alpha, rtol=1e-9, atol=1e-9)
 
 
+@pytest.mark.slow
 def test_fit_recovers_the_relevant_coordinates_and_warm_starts_cost_little():
     rng = np.random.default_rng(0)
     dim, n, size = 6, 60, 64

@@ -177,6 +177,7 @@ def test_bad_input():
         rare_events.subset_simulation(linear, 1.0, DIM, key=KEY, n=50)
 
 
+@pytest.mark.slow
 def test_steps_and_ties_are_counted_not_climbed():
     """One output in a thousand is 1, the others are 0: there is no ladder to climb."""
 

@@ -98,6 +98,7 @@ def test_loss_is_equation_4_6(trained):
     np.testing.assert_allclose(doubled, total, rtol=1e-4)
 
 
+@pytest.mark.slow
 def test_search_trains_on_counted_simulations_and_resumes(tmp_path):
     search = bayesopt.SearchConfig(
         TASK, "rev_argate_bnn", seeds=(0, 1), n_init=10, n_total=16, embedding_dim=3,

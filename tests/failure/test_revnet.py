@@ -16,6 +16,7 @@ def trained(dim, depth, width, seed, dtype):
     return params._replace(b1=0.5 * noise, b2=-0.3 * noise)
 
 
+@pytest.mark.slow
 @settings(max_examples=6, deadline=None)
 @given(
     dim=st.integers(2, 9), depth=st.integers(1, 6), width=st.integers(1, 7), seed=st.integers(0, 99)

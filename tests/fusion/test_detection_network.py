@@ -349,6 +349,7 @@ FAILING = DetectorTrainConfig(
 RATES = DetectorParams(learning_rate=3e-3, l2=0.0, l2_dense=0.0)
 
 
+@pytest.mark.slow
 @pytest.mark.relaxed
 def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) -> None:
     folder = tmp_path / "checkpoints"

@@ -60,6 +60,7 @@ def test_bodies_that_both_sensors_see(tmp_path: Path) -> None:
         read_bodies(path, CONFIG)
 
 
+@pytest.mark.slow
 def test_crops_are_those_of_the_boxes() -> None:
     rows, columns = CONFIG.image_size
     # A picture whose red is the column and whose green is the row, both from 0 to 1.

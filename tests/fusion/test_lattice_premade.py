@@ -2,14 +2,12 @@
 
 from __future__ import annotations
 
-import doctest
-
 import jax
 import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.lattice import LatticeClassifier, LatticeRegressor, estimators, premade, project_tree
+from fusion.lattice import LatticeClassifier, LatticeRegressor, premade, project_tree
 from fusion.lattice.premade import CalibratedConfig, Feature
 from fusion.lattice.quantiles import quantile_keypoints
 from fusion.lattice.tagged import tag
@@ -46,6 +44,7 @@ def test_directions_and_orders_hold_for_the_whole_model(kind: str) -> None:
     assert np.isfinite(np.asarray(apply(jnp.asarray(rows, jnp.float32)))).all()
 
 
+@pytest.mark.slow
 def test_a_regressor_learns_a_monotone_surface_and_keeps_it() -> None:
     rng = np.random.default_rng(1)
     x = rng.uniform(0.0, 1.0, (400, 2))
@@ -87,9 +86,3 @@ def test_quantiles_share_the_data_and_increase() -> None:
     counts = np.histogram(data[5:, 0], places[0])[0]
     np.testing.assert_allclose(counts, 199, atol=2)
     assert set(places[1]) >= {0.0, 1.0, 2.0}
-
-
-@pytest.mark.parametrize("module", [estimators, premade])
-def test_examples(module: object) -> None:
-    result = doctest.testmod(module)
-    assert result.failed == 0 and result.attempted > 0

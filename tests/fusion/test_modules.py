@@ -51,6 +51,7 @@ def batch(n: int = 96) -> tuple[list[jax.Array], jax.Array]:
     return [jnp.asarray(a, jnp.float32) for a in arrays], jnp.asarray(y, jnp.int32)
 
 
+@pytest.mark.slow
 def test_training_with_any_encoders_keeps_the_lattice_monotone() -> None:
     readings, labels = batch()
     loss = ARGateLoss(network(LatticeTargets(LATTICE)), LEARNED)

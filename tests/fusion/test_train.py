@@ -139,6 +139,7 @@ def test_non_finite_loss_stops_and_keeps_the_last_good_state(tmp_path: Path) -> 
     fit(MODEL, TRAIN, HYPER, DATA, NOISE, **rest)
 
 
+@pytest.mark.slow
 def test_whole_run_vmaps_over_seeds_and_hyper_parameters(trained: object) -> None:
     train = make_train(MODEL, TRAIN, len(DATA.train_x), ONE_CLEAN, "uniform")
     x, y = jnp.asarray(DATA.train_x), jnp.asarray(DATA.train_y)

@@ -65,6 +65,7 @@ def test_env_agrees_with_the_world_and_with_our_own_env(env: Any) -> None:
     np.testing.assert_allclose(theirs.pipeline_state.robot.x, moved.x, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_brax_wrappers_run_and_reset(brax_env: Any, env: Any) -> None:
     from brax.envs import training
 

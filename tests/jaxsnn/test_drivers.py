@@ -45,6 +45,7 @@ def test_drivers_side_by_side_are_one_by_one():
     np.testing.assert_array_equal(many, jnp.stack([one(d) for d in distances]))
 
 
+@pytest.mark.slow
 def test_drivers_solve_the_short_scenarios_and_none_of_the_detours():
     for number in (1, 2, 3):
         easy, hard = (difficulty(m(number)) for m in (scenarios.scenario, scenarios.detour))

@@ -79,6 +79,7 @@ def test_it_finds_the_known_best_action_and_value() -> None:
     assert result.metrics.entropy[-1] < result.metrics.entropy[0]
 
 
+@pytest.mark.slow
 @pytest.mark.relaxed  # optax, as above
 def test_robots_learn_to_arrive_in_scenario_1() -> None:
     config = ppo.PPOConfig(n_envs=8, n_steps=64, n_updates=40)

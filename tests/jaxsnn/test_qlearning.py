@@ -108,6 +108,7 @@ def test_trials_are_booked_once_each(lane: world.WorldParams, learned: Any) -> N
     assert (tables != 0).any()
 
 
+@pytest.mark.slow
 def test_learners_are_independent_of_their_batch_and_can_go_on(
     lane: world.WorldParams, learned: Any
 ) -> None:

@@ -41,6 +41,7 @@ def test_scans_keep_the_dtype_of_their_state(double: bool) -> None:
         np.testing.assert_allclose(same, total, rtol=1e-12 if double else 1e-4, atol=1e-9)
 
 
+@pytest.mark.slow
 @pytest.mark.relaxed
 def test_an_experiment_runs_in_double_precision() -> None:
     config, params = preset("S4", config=SMALL)

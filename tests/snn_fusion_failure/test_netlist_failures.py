@@ -81,6 +81,7 @@ def test_worst_cases_yield_and_files(config: NetlistConfig, capsys) -> None:
     assert len(samples) == 60 and {"a", "b", "out", "what_for"} <= set(samples[0])
 
 
+@pytest.mark.slow
 def test_a_larger_budget_and_earlier_samples_pay_for_nothing_twice(config: NetlistConfig) -> None:
     first = netlist_failures.main(config)
     with pytest.raises(ValueError, match="already holds a run; pass --resume"):
@@ -103,6 +104,7 @@ def test_a_larger_budget_and_earlier_samples_pay_for_nothing_twice(config: Netli
         netlist_failures.main(dataclasses.replace(start, start=bad, overwrite=True))
 
 
+@pytest.mark.slow
 def test_corners_count_with_their_worst(config: NetlistConfig) -> None:
     corners = ("tt", "off:shift=0")
     result = netlist_failures.main(dataclasses.replace(config, corners=corners))

@@ -319,6 +319,7 @@ def test_times_of_the_tables_are_kept(tmp_path: Path) -> None:
         assert set(times[kind]) == {"4.1"} and times[kind]["4.1"] >= 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.relaxed  # the optimizer's own promotions
 def test_without_har_the_quick_piece_says_that_it_is_simulated(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]

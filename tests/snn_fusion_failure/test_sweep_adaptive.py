@@ -54,7 +54,7 @@ def valley(tmp_path) -> sweep.Config:
 AXES = ("x=-2:2", "y=-2:2")
 
 
-@pytest.mark.parametrize("kind", ["tpe", "cma", "gp"])
+@pytest.mark.parametrize("kind", ["tpe", "cma", pytest.param("gp", marks=pytest.mark.slow)])
 @pytest.mark.relaxed
 def test_an_adaptive_design_finds_the_valley_and_goes_on_after_a_loss(
     valley, tmp_path, kind

@@ -9,6 +9,8 @@ import time
 from pathlib import Path
 from typing import Any
 
+import pytest
+
 from snn_fusion_failure.commands import sweep
 from snn_fusion_failure.sweeps.folder import done_chunks
 from tests.snn_fusion_failure import sweep_toy
@@ -29,6 +31,7 @@ def stamps(out: Path) -> dict[str, tuple[int, int]]:
     return found
 
 
+@pytest.mark.slow
 def test_twenty_kills_change_nothing(tmp_path) -> None:
     whole, out, log = tmp_path / "whole", tmp_path / "killed", tmp_path / "log"
     sweep.main(dataclasses.replace(CONFIG, out=whole))

@@ -7,7 +7,7 @@ NEWER  ?= python3.13
 # The versions that the suite has passed with; `make CONSTRAINTS= test` takes the newest there are.
 CONSTRAINTS ?= constraints.txt
 INSTALL := -m pip install -q --disable-pip-version-check $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
-# Of the slow tests a third, another one each day: `make slow PART=0/1` runs all of them.
+# Of the slow tests and the documented commands a third, another one each day; all by PART=0/1.
 PART   ?= $(shell expr $$(date +%j) % 3)/3
 
 # Compiled programs are kept between runs: compiling is most of the time of a short one.
@@ -46,8 +46,8 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 slow: $(VENV)/.dev  ## a third of the long tests, another third every day
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
 
-commands: $(VENV)/.dev  ## run every command of README and docs at its smallest size, in a copy
-	$(BIN)/python scripts/tools/check_commands.py --jobs $(JOBS)
+commands: $(VENV)/.dev  ## run the commands of README and docs (a third, another every day) at their smallest size
+	$(BIN)/python scripts/tools/check_commands.py --jobs $(JOBS) --part $(PART)
 
 lint: $(VENV)/.dev  ## ruff: style and errors
 	$(BIN)/ruff check .
@@ -68,7 +68,7 @@ lowest: $(VENV)/.dev  ## a few test files with the lowest allowed versions, in a
 newer: $(VENV)/.dev  ## the same test files with a newer Python, in an environment of their own
 	$(BIN)/python scripts/tools/check_lowest.py --python $(NEWER) --versions constraints
 
-check: lint types docs wheel test slow commands lowest  ## everything; CI runs a part of commands and leaves slow, lowest and newer out
+check: lint types docs wheel lowest test slow commands  ## what CI runs: everything, of the long tests and commands a third
 
 clean:  ## remove what the other commands made, but not runs/ or results/
 	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

@@ -2,6 +2,7 @@
 
     python scripts/tools/check_commands.py
     python scripts/tools/check_commands.py --only train_snn reproduce
+    python scripts/tools/check_commands.py --part 0/3
 
 The commands are those that a reader finds, with the options of the table in
 snn_fusion_failure/documentation/documented.py appended. They run in a copy of the repository in a

@@ -2,6 +2,7 @@
 
     python scripts/tools/check_commands.py
     python scripts/tools/check_commands.py --only train_snn reproduce
+    python scripts/tools/check_commands.py --part 0/3
 
 The commands are those that a reader finds, with the options of the table in
 snn_fusion_failure/documentation/documented.py appended. They run in a copy of the repository in a
@@ -46,6 +47,8 @@ class Config:
 
     only: tuple[str, ...] = ()
     """Only commands in which one of these texts occurs."""
+    part: str = "0/1"
+    """Of the areas (commands that build on each other) only every N-th, from the I-th: I/N."""
     jobs: int = 2
     """Processes side by side."""
     list: bool = False
@@ -192,20 +195,42 @@ def run_area(folder: Path, numbers: Sequence[int]) -> Iterator[Done]:
         yield Done(number, 0.0, 0.0, f"its process ended with status {process.returncode}")
 
 
+def areas_of(part: str) -> set[str]:
+    """The areas of a part I/N, dealt out in alphabetical order.
+
+    Raises:
+        ValueError: `part` is not of this form, or I is not below N.
+
+    Example:
+        >>> areas_of("0/1") == areas_of("0/2") | areas_of("1/2")
+        True
+    """
+    index, _, count = part.partition("/")
+    if not (index.isdigit() and count.isdigit() and int(index) < int(count)):
+        raise ValueError(f"part={part!r}: expected I/N with I < N; type for example 0/3")
+    areas = sorted({command.area for command in documented.documented()})
+    return set(areas[int(index) :: int(count)])
+
+
 def choose(config: Config) -> tuple[dict[int, documented.Command], dict[int, str]]:
     """Commands to run, and why others are not, by number.
 
     Raises:
-        ValueError: the table has no rule for a command, or `only` leaves none.
+        ValueError: the table has no rule for a command, `part` is no part, or `only` and `part`
+            leave none.
     """
     commands = dict(enumerate(documented.documented()))
+    areas = areas_of(config.part)
     chosen = {
         n: c
         for n, c in commands.items()
-        if not config.only or any(text in c.text for text in config.only)
+        if c.area in areas and (not config.only or any(text in c.text for text in config.only))
     }
     if not chosen:
-        raise ValueError(f"only={config.only}: no documented command has one of these texts")
+        raise ValueError(
+            f"only={config.only}, part={config.part!r}: no documented command is left; "
+            "see all of them by --list"
+        )
     lacking = [c.text for c in chosen.values() if c.rule is None]
     if lacking:
         raise ValueError(

@@ -145,3 +145,11 @@ def test_quick_commands_run_in_a_copy(tmp_path: Path, capsys: pytest.CaptureFixt
     assert copied["command"] == "python scripts/studies/compare_snn.py"
     assert copied["git"] == "unknown"  # which is how one sees that it is the copy's
     assert {p: p.stat().st_mtime_ns for p in before} == before
+
+
+def test_the_parts_are_all_commands_once() -> None:
+    parts = [check_commands.choose(check_commands.Config(part=f"{i}/3"))[0] for i in range(3)]
+    assert sum(map(len, parts)) == len(check_commands.choose(check_commands.Config())[0])
+    assert all(parts)
+    with pytest.raises(ValueError, match="part='3/3': expected I/N"):
+        check_commands.choose(check_commands.Config(part="3/3"))

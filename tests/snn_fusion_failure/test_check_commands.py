@@ -8,7 +8,7 @@ from pathlib import Path
 
 import pytest
 
-from snn_fusion_failure.documentation import check_commands, documented
+from snn_fusion_failure.documentation import check_commands, documented, executing
 from snn_fusion_failure.documentation.documented import RULES, Command, Rule
 from snn_fusion_failure.runs import repository
 
@@ -93,7 +93,7 @@ def test_a_command_that_fails_is_seen(tmp_path: Path, code: str, error: str) -> 
     script = tmp_path / "script.py"
     script.write_text(code, encoding="utf-8")
     held = list(sys.argv)
-    assert check_commands.execute([str(script), "--out"], tmp_path / "log") == error
+    assert executing.execute([str(script), "--out"], tmp_path / "log") == error
     assert sys.argv == held
     if not error:
         assert (tmp_path / "log.out").read_text().strip() == "result: a=1 --out"
@@ -102,13 +102,13 @@ def test_a_command_that_fails_is_seen(tmp_path: Path, code: str, error: str) -> 
 
 
 def test_one_line_of_python_needs_no_result(tmp_path: Path) -> None:
-    assert check_commands.execute(["python", "-c", "print(1)"], tmp_path / "log") == ""
-    assert check_commands.execute(["python", "-c", "1 / 0"], tmp_path / "log").startswith("Zero")
+    assert executing.execute(["python", "-c", "print(1)"], tmp_path / "log") == ""
+    assert executing.execute(["python", "-c", "1 / 0"], tmp_path / "log").startswith("Zero")
 
 
 def test_a_process_that_dies_fails_its_commands(tmp_path: Path) -> None:
     """The folder is no copy, so the process gives up before its first command."""
-    done = list(check_commands.run_area(tmp_path, [3, 4]))
+    done = list(executing.run_area(tmp_path, [3, 4]))
     assert [d.number for d in done] == [3, 4]
     assert all("ended with status 1" in d.error for d in done)
 

@@ -23,17 +23,20 @@ class Recipe:
         gate: where the fusion weights come from; `"none"` is plain late fusion.
         loss: which terms of the loss it has: auxiliary paths (WS), weighted (ALW), targets (FWR).
         modality_dropout: probability that a sensor's features are dropped in training.
+        printed: Equations 3.1 and 3.2 to the letter; presets add nothing to them.
     """
 
     gate: Literal["none", "learned", "oracle", "embrace"]
     loss: LossConfig
     modality_dropout: float = 0.0
+    printed: bool = False
 
 
 _MAIN = LossConfig(
     auxiliary=False, loss_weighting=False, regularization=False, learned_targets=False
 )
 _PATHS = dataclasses.replace(_MAIN, auxiliary=True)
+_PRINTED = LossConfig(fixed_targets="softmax_sigmoid", stop_targets=False, label_smoothing=0.0)
 
 MODELS: dict[str, Recipe] = {
     "baseline": Recipe("none", _MAIN),
@@ -41,11 +44,19 @@ MODELS: dict[str, Recipe] = {
     "argate_ws": Recipe("learned", _PATHS),
     "argate_plus": Recipe("learned", LossConfig(learned_targets=False)),
     "argate_l": Recipe("learned", LossConfig()),
+    "equal_weights": Recipe("none", _MAIN),
+    "argate_plus_printed": Recipe(
+        "learned", dataclasses.replace(_PRINTED, learned_targets=False), printed=True
+    ),
+    "argate_l_printed": Recipe("learned", _PRINTED, printed=True),
     "modality_dropout": Recipe("none", _MAIN, modality_dropout=0.2),
     "embracenet": Recipe("embrace", _MAIN),
     "oracle": Recipe("oracle", _PATHS),
 }
 """The models by name. The first five are the source's; the others are references."""
+
+
+Head = Literal["dense", "neighbourhood"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -57,10 +68,15 @@ class ModelConfig:
         n_sensors, n_times, n_classes: shape of the problem.
         encoder: the unisensory encoders.
         gate_width: hidden units of the FC-con block.
+        own_scores: features also add to their own sensor's score, see `fusion.gating.Gate`.
         head_widths: hidden layers after fusion; `match_parameters` moves the first.
         aux_width: hidden units of each auxiliary head; 0 for a linear head.
         embrace_width: width that EmbraceNet docks each sensor's features to before it draws.
         dropout: rate after fusion and in the head, in training.
+        head: what reads the weighted features: `"dense"` layers, or `"neighbourhood"`, which adds
+            the classes of near training rows (scalar sensors with tables only).
+        memory_rows: training rows that each step compares with (neighbourhood).
+        sharpening: factor on the learned sharpness where all rows are compared with.
         fusion: `"concat"` keeps each sensor's features apart, `"sum"` adds them.
         scale: `"mean"` multiplies weights by K, `"max"` divides them by the largest.
         normalizer: of the fusion weights, see `fusion.gating.normalize`.
@@ -75,10 +91,14 @@ class ModelConfig:
     n_classes: int = 6
     encoder: EncoderConfig = dataclasses.field(default_factory=EncoderConfig)
     gate_width: int = 32
+    own_scores: bool = False
     head_widths: tuple[int, ...] = (128,)
     aux_width: int = 0
     embrace_width: int = 128
     dropout: float = 0.2
+    head: Head = "dense"
+    memory_rows: int = 4096
+    sharpening: float = 4.0
     fusion: Fusion = "concat"
     scale: Scaling = "mean"
     normalizer: Normalizer = "softmax"
@@ -92,6 +112,15 @@ class ModelConfig:
         for name, options in (("fusion", Fusion), ("scale", Scaling), ("normalizer", Normalizer)):
             check_choice(name, getattr(self, name), get_args(options))
         check_choice("weight_sharing", self.weight_sharing, (True, False))
+        check_choice("own_scores", self.own_scores, (True, False))
+        check_choice("head", self.head, get_args(Head))
+        check_count("memory_rows", self.memory_rows)
+        check_number("sharpening", self.sharpening, 0.0, above=True, fix="1 changes nothing")
+        if self.head == "neighbourhood" and (self.n_times, self.encoder.scalar) != (1, "table"):
+            raise ValueError(
+                f"head={self.head!r}: expected scalar sensors (n_times=1) with "
+                "encoder.scalar='table'; use head='dense' for others"
+            )
         check_number("dropout", self.dropout, 0.0, 1.0, below=True, fix="it is a rate")
         for name in ("n_sensors", "n_times", "gate_width", "embrace_width"):
             check_count(name, getattr(self, name))
@@ -109,7 +138,7 @@ class ModelConfig:
             return
         check_type("loss", self.loss, LossConfig, "build a LossConfig")
         gate = MODELS[self.model].gate
-        for name in ("loss_weighting", "regularization"):
+        for name in ("loss_weighting", "regularization", "mask_supervision"):
             if getattr(self.loss, name) and gate != "learned":
                 raise ValueError(
                     f"loss.{name}=True: expected a model with a learned gate, {self.model!r} has "

@@ -18,8 +18,10 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from fusion._checks import check_choice, check_count, check_counts
+from fusion.tables import TableEncoder
 
 Backend = Literal["matmul", "conv"]
+ScalarKind = Literal["fourier", "table"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -35,6 +37,10 @@ class EncoderConfig:
         frequencies: number of octaves of the Fourier features of a scalar (scalars only).
         levels: sorted readings that each sensor gave in training, one tuple per sensor (scalars
             only); adds the distance to the nearest of them, see `reading_levels`. Empty for none.
+        scalar: `"fourier"` encodes a scalar by octaves of its value, `"table"` by a learned row
+            for each of its levels, see `fusion.tables.TableEncoder`.
+        ranks: share of training rows below each level, for the first rows of the tables.
+        known_readings: a table gives a token of its own for readings that are no level.
         backend: how `conv1d` is computed; `"matmul"` for CPU, `"conv"` for accelerators.
     """
 
@@ -45,6 +51,9 @@ class EncoderConfig:
     spectral: bool = True
     frequencies: int = 8
     levels: tuple[tuple[float, ...], ...] = ()
+    scalar: ScalarKind | str = "fourier"
+    ranks: tuple[tuple[float, ...], ...] = ()
+    known_readings: bool = True
     backend: Backend | str = "matmul"
 
     def __post_init__(self) -> None:
@@ -61,6 +70,18 @@ class EncoderConfig:
                     f"levels[{k}]={row}: expected sorted, different, finite readings; make levels "
                     "with reading_levels"
                 )
+        check_choice("scalar", self.scalar, get_args(ScalarKind))
+        check_choice("known_readings", self.known_readings, (True, False))
+        if self.scalar == "table" and self.features < 3:
+            raise ValueError(
+                f"features={self.features}: expected at least 3 for a table, one of them flags "
+                "unknown readings; raise it"
+            )
+        if self.ranks and [len(r) for r in self.ranks] != [len(r) for r in self.levels]:
+            raise ValueError(
+                f"ranks={len(self.ranks)} rows: expected one rank for each level; make ranks with "
+                "reading_ranks"
+            )
 
 
 def conv1d(
@@ -201,6 +222,11 @@ class SeriesEncoder(nn.Module):
         return nn.relu(stacked_dense(self, "out", jnp.concatenate(paths, -1), config.features))
 
 
+def readings_recur(x: Float[np.ndarray, "n k 1"]) -> bool:
+    """Whether every sensor gives few distinct readings, each about eight times or more."""
+    return all(8 * len(np.unique(x[:, k])) <= len(x) for k in range(x.shape[1]))
+
+
 def reading_levels(
     x: Float[np.ndarray, "n k 1"], limit: int = 512
 ) -> tuple[tuple[float, ...], ...]:
@@ -253,6 +279,14 @@ class ScalarEncoder(nn.Module):
 def encoder(config: EncoderConfig, n_times: int, name: str) -> nn.Module:
     """The encoder for windows of `n_times` samples: `ScalarEncoder` for one, else the series."""
     shortest = config.conv_kernels[0] + config.conv_strides[0] * (config.conv_kernels[1] - 1)
+    if n_times == 1 and config.scalar == "table":
+        if not config.levels:
+            raise ValueError(
+                "levels=(): expected the readings that the tables are for; make levels with "
+                "reading_levels"
+            )
+        parts = config.levels, config.ranks, config.features, config.known_readings
+        return TableEncoder(*parts, name=name)
     if n_times == 1:
         return ScalarEncoder(config, name=name)
     if n_times < shortest:

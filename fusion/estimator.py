@@ -11,7 +11,7 @@ from jaxtyping import Float
 from fusion._checks import check_count, check_number
 from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data import from_arrays
-from fusion.encoders import EncoderConfig, reading_levels
+from fusion.encoders import EncoderConfig, reading_levels, readings_recur
 from fusion.failures import random_failing
 from fusion.fitted import FittedARGate, Prediction, finish
 from fusion.loop import Corruption, fit
@@ -23,11 +23,6 @@ except ImportError as error:
     raise ImportError(
         "fusion.estimator needs scikit-learn: pip install 'snn-fusion-failure[sklearn]'"
     ) from error
-
-
-def _recur(x: Float[np.ndarray, "n k 1"]) -> bool:
-    """Whether every sensor gives few distinct readings, each about eight times or more."""
-    return all(8 * len(np.unique(x[:, k])) <= len(x) for k in range(x.shape[1]))
 
 
 class ARGateClassifier(ClassifierMixin, BaseEstimator):
@@ -102,7 +97,7 @@ class ARGateClassifier(ClassifierMixin, BaseEstimator):
         )
         k, t = data.n_channels, data.n_time
         # Known readings help where readings recur; of a continuous sensor no reading ever does.
-        levels = reading_levels(data.train_x) if t == 1 and _recur(data.train_x) else ()
+        levels = reading_levels(data.train_x) if t == 1 and readings_recur(data.train_x) else ()
         model = ModelConfig(
             self.model,
             n_sensors=k,

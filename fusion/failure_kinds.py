@@ -13,6 +13,8 @@ from fusion._checks import check_choice, check_key, check_number
 
 FailureKind = Literal["uniform", "gaussian", "zero", "stuck", "drift", "dropout", "gain", "clip"]
 FAILURE_KINDS: tuple[FailureKind, ...] = get_args(FailureKind)
+Kinds = FailureKind | str | tuple[str, ...]
+"""One kind for all examples, or several of which each example gets one."""
 
 # Sizes of the failures that the source does not have; inputs span [-1, 1].
 DRIFT_RANGE = (0.5, 2.0)  # offset reached after one whole window
@@ -102,10 +104,23 @@ _FAILED: dict[str, Callable[[Key[Array, ""], Array], Array]] = {
 }
 
 
+def check_kinds(name: str, kinds: Kinds | None) -> None:
+    """Refuse what is neither a kind nor a mixture of different kinds."""
+    if not isinstance(kinds, tuple):
+        check_choice(name, kinds, FAILURE_KINDS)
+        return
+    for kind in kinds:
+        check_choice(name, kind, FAILURE_KINDS)
+    if not kinds or len(set(kinds)) < len(kinds):
+        raise ValueError(
+            f"{name}={kinds}: expected one or more different kinds; leave the repeated ones out"
+        )
+
+
 def apply_failure(
     x: Float[Array, "n k t"],
     mask: Bool[Array, "n k"],
-    kind: FailureKind | str,
+    kind: Kinds,
     *,
     key: Key[Array, ""],
     severity: float | Float[Array, ""] = 1.0,
@@ -129,7 +144,7 @@ def apply_failure(
     Args:
         x: windows scaled to [-1, 1].
         mask: True where a channel has failed, from `draw_mask`.
-        kind: one of `FAILURE_KINDS` (static).
+        kind: one of `FAILURE_KINDS`, or several of which each example draws one (static).
         key: typed PRNG key; only the values depend on it, not the mask.
         severity: share of the way from the clean to the failed reading.
 
@@ -143,10 +158,17 @@ def apply_failure(
     so a third of its samples lie outside [-1, 1], as the source's definition has it. The other
     kinds are ours, for robustness scores.
     """
-    check_choice("kind", kind, FAILURE_KINDS)
+    check_kinds("kind", kind)
     check_number("severity", severity, 0.0, 1.0, fix="it is a share; 1 is a whole failure")
     check_key(key)
-    failed = _FAILED[kind](key, x)
+    if isinstance(kind, tuple):
+        draw_key, *keys = jax.random.split(key, 1 + len(kind))
+        drawn = jax.random.randint(draw_key, x.shape[:1], 0, len(kind))[:, None, None]
+        failed = x
+        for number, (one, one_key) in enumerate(zip(kind, keys, strict=True)):
+            failed = jnp.where(drawn == number, _FAILED[one](one_key, x), failed)
+    else:
+        failed = _FAILED[kind](key, x)
     if not (isinstance(severity, float) and severity == 1.0):
         failed = x + jnp.asarray(severity, x.dtype) * (failed - x)
     return jnp.where(mask[:, :, None], failed, x)

@@ -17,7 +17,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
 from fusion._checks import check_choice, check_count, check_key, check_number
-from fusion.failure_kinds import FAILURE_KINDS, FailureKind, apply_failure
+from fusion.failure_kinds import Kinds, apply_failure, check_kinds
 
 
 @dataclasses.dataclass(frozen=True)
@@ -185,7 +185,7 @@ def draw_mask(protocol: Protocol, n: int, *, key: Key[Array, ""]) -> Bool[Array,
 def corrupt(
     protocol: Protocol,
     x: Float[Array, "n k t"],
-    kind: FailureKind | str = "uniform",
+    kind: Kinds = "uniform",
     *,
     key: Key[Array, ""],
     severity: float | Float[Array, ""] = 1.0,
@@ -212,7 +212,7 @@ def corrupt(
         (4, 12, 6.0)
     """
     check_key(key)
-    check_choice("kind", kind, FAILURE_KINDS)
+    check_kinds("kind", kind)
     if x.ndim != 3 or x.shape[1] != protocol.n_channels:
         raise ValueError(
             f"x.shape={tuple(x.shape)}: expected [N, {protocol.n_channels}, T], the protocol's "

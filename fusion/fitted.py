@@ -47,13 +47,14 @@ class Prediction(NamedTuple):
 
 
 @functools.partial(jax.jit, static_argnums=0)
-def _run(
+def classify(
     config: ModelConfig,
     main: Params,
     monitor: MonitorParams,
     temperature: Float[Array, ""],
     x: Float[Array, "b k t"],
 ) -> tuple[Array, Array, Array]:
+    """Class probabilities, fusion weights and failure probabilities of scaled windows."""
     absent = jnp.any(jnp.isnan(x), axis=-1)
     out = predict(config, main, x, absent)
     calls = jnp.where(
@@ -127,7 +128,9 @@ class FittedARGate:
             absent |= ~np.asarray(available, bool)
         scaled = apply_scale(raw, self.scale)
         scaled = np.where(absent[:, :, None], np.float32(np.nan), scaled)
-        arrays = _run(self.config, self.params, self.monitor, jnp.float32(self.temperature), scaled)
+        arrays = classify(
+            self.config, self.params, self.monitor, jnp.float32(self.temperature), scaled
+        )
         probabilities, weights, calls = map(np.asarray, arrays)
         margin = FAR * (self.scale.high - self.scale.low)
         low, high = (self.scale.low - margin)[:, None], (self.scale.high + margin)[:, None]

@@ -51,11 +51,19 @@ class Gate(nn.Module):
     `[branch, batch, feature] -> [batch, branch]`; the last layer starts at zero, so that training
     starts from equal weights.
 
-    Source: Patel et al. (IROS 2017), NetGated; Shim (2020), Figures 3.1 and 3.3.
+    Attributes:
+        width: of the hidden layer.
+        normalizer: of the scores.
+        own_scores: each sensor's features also add to its own score directly, without the hidden
+            layer; then one flag of a sensor is enough to silence it.
+
+    Source: Patel et al. (IROS 2017), NetGated; Shim (2020), Figures 3.1 and 3.3. Deviation: own
+    scores, off by default.
     """
 
     width: int
     normalizer: Normalizer
+    own_scores: bool = False
 
     @nn.compact
     def __call__(self, features: Float[Array, "k b f"]) -> Float[Array, "b k"]:
@@ -64,6 +72,9 @@ class Gate(nn.Module):
         joined = jnp.transpose(features, (1, 0, 2)).reshape(b, -1)
         hidden = nn.relu(nn.Dense(self.width, name="fc_con")(joined))
         scores = nn.Dense(k, kernel_init=nn.initializers.zeros, name="split")(hidden)
+        if self.own_scores:
+            own = self.param("own", nn.initializers.zeros, features.shape[::2])
+            scores = scores + jnp.einsum("kbf,kf->bk", features, own)
         return normalize(scores, self.normalizer)
 
 

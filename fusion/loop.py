@@ -21,7 +21,7 @@ from fusion._checkpoints import Checkpoints, settings_of
 from fusion._checks import check_choice, check_count, check_key, check_number, check_type
 from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
-from fusion.failure_kinds import FAILURE_KINDS, FailureKind
+from fusion.failure_kinds import Kinds, check_kinds
 from fusion.failures import Protocol, corrupt
 from fusion.models import export
 from fusion.train import TrainState, init_state, make_epoch, predict_batches
@@ -33,15 +33,16 @@ class Corruption:
 
     Attributes:
         train, test: protocols (they differ in the generalisation test only).
-        kind: failure in training; test_kind: in test, the same when None.
+        kind: failure in training, or several of which each example draws one; test_kind: in test,
+            the same when None.
         redraw: draw masks and noise anew in every epoch; False is the literal reading of the
             source, drawn once.
     """
 
     train: Protocol
     test: Protocol
-    kind: FailureKind | str = "uniform"
-    test_kind: FailureKind | str | None = None
+    kind: Kinds = "uniform"
+    test_kind: Kinds | None = None
     redraw: bool = True
 
     def __post_init__(self) -> None:
@@ -53,8 +54,9 @@ class Corruption:
                 f"test.n_channels={self.test.n_channels}: expected {self.train.n_channels} as in "
                 "training; build both protocols from the channels of one data set"
             )
-        check_choice("kind", self.kind, FAILURE_KINDS)
-        check_choice("test_kind", self.test_kind, (None, *FAILURE_KINDS))
+        check_kinds("kind", self.kind)
+        if self.test_kind is not None:
+            check_kinds("test_kind", self.test_kind)
         check_choice("redraw", self.redraw, (True, False))
 
 
@@ -140,7 +142,8 @@ def fit(
     check_count("checkpoint_every", checkpoint_every)
     check_number("checkpoint_minutes", checkpoint_minutes, 0.0, fix="0 saves every epoch")
     init_key, epoch_key, noise_key = (jax.random.fold_in(key, i) for i in range(3))
-    state = init_state(init_key, model, train)
+    x, y = jnp.asarray(data.train_x), jnp.asarray(data.train_y)
+    state = init_state(init_key, model, train, (x, y))
     history: list[dict[str, float]] = []
     start, checkpoints = 0, None
     if checkpoint_dir is not None:
@@ -156,7 +159,6 @@ def fit(
         checkpoints = Checkpoints(Path(checkpoint_dir), settings, checkpoint_minutes)
         if (held := checkpoints.restore(state, resume=resume)) is not None:
             start, state, history = held
-    x, y = jnp.asarray(data.train_x), jnp.asarray(data.train_y)
     hyper = jax.tree.map(lambda leaf: jnp.asarray(leaf, jnp.float32), hyper)
     step = _epoch(model, train, len(x))
     done = start
@@ -196,7 +198,7 @@ def test_output(
     noise: Corruption,
     *,
     key: Key[Array, ""],
-    kind: FailureKind | str | None = None,
+    kind: Kinds | None = None,
 ) -> TestOutput:
     """Run the exported main model on the corrupted test rows `[N, K, T]`.
 
@@ -213,7 +215,8 @@ def test_output(
     """
     _check(model, data, noise)
     check_key(key)
-    check_choice("kind", kind, (None, *FAILURE_KINDS))
+    if kind is not None:
+        check_kinds("kind", kind)
     kind = kind or noise.test_kind or noise.kind
     test_key = jax.random.fold_in(key, 3)
     x, failed = _corrupt(noise.test, jnp.asarray(data.test_x), kind, key=test_key)

@@ -4,14 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Iterable
-from typing import Any, NamedTuple, get_args
+from typing import Any, Literal, NamedTuple, get_args
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
 from fusion._checks import check_choice, check_number
-from fusion.gating import Normalizer, normalize
+from fusion.gating import Normalizer, normalize, oracle_weights
 
 
 class _LossParams(NamedTuple):
@@ -19,6 +19,7 @@ class _LossParams(NamedTuple):
     beta: float | Array = 1.0
     tau: float | Array = 1.0
     anchor: float | Array = 0.0
+    mask: float | Array = 1.0
 
 
 class LossParams(_LossParams):
@@ -29,13 +30,14 @@ class LossParams(_LossParams):
         beta: weight of the fusion-weight regularization (Equation 3.1), >= 0.
         tau: temperature of the target `softmax(-loss / tau)`, > 0; unused by the printed target.
         anchor: weight that pulls learned targets to `softmax(-loss / tau)`, >= 0; 0 as printed.
+        mask: weight of the mask of simulated failures, >= 0; read with `mask_supervision` only.
 
     Raises:
         ValueError: a number out of its range. Arrays and traced values are not looked at.
 
     Example:
         >>> LossParams(alpha=0.5)
-        LossParams(alpha=0.5, beta=1.0, tau=1.0, anchor=0.0)
+        LossParams(alpha=0.5, beta=1.0, tau=1.0, anchor=0.0, mask=1.0)
     """
 
     __slots__ = ()
@@ -46,16 +48,26 @@ class LossParams(_LossParams):
         beta: Any = 1.0,
         tau: Any = 1.0,
         anchor: Any = 0.0,
+        mask: Any = 1.0,
     ) -> LossParams:
         """Check the numbers that are given as numbers."""
-        for name, value in (("alpha", alpha), ("beta", beta), ("anchor", anchor)):
+        for name, value in (
+            ("alpha", alpha),
+            ("beta", beta),
+            ("anchor", anchor),
+            ("mask", mask),
+        ):
             check_number(name, value, 0.0, fix="0 leaves the term out")
         check_number("tau", tau, 0.0, above=True, fix="small temperatures give sharp targets")
-        return super().__new__(cls, alpha, beta, tau, anchor)
+        return super().__new__(cls, alpha, beta, tau, anchor, mask)
 
     @classmethod
     def _make(cls, iterable: Iterable[Any]) -> LossParams:  # type: ignore[override]
         return cls(*iterable)
+
+
+Imitation = Literal["squared", "kl"]
+TargetTraining = Literal["imitation", "held_out"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -68,6 +80,11 @@ class LossConfig:
         regularization: fusion weights are pulled to targets (FWR).
         learned_targets: the targets come from the monotone lattice (Equation 3.2).
         fixed_targets: form of the targets that are made of the losses, see `loss_targets`.
+        imitation: how far weights lie from targets: `"squared"` as printed, or `"kl"`, see
+            `distance_to_targets`.
+        target_training: what learned targets are trained by: `"imitation"` of the weights as in
+            Equation 3.2, or `"held_out"` rows, see `fusion.bilevel`.
+        mask_supervision: the weights learn from the mask of simulated failures, see `mask_penalty`.
         stop_targets: no gradient from the regularization into the auxiliary losses; without it
             the auxiliary heads can be made worse to please the gate.
         stop_weights: no gradient of the alpha term into the fusion weights; with it the term trains
@@ -82,6 +99,9 @@ class LossConfig:
     regularization: bool = True
     learned_targets: bool = True
     fixed_targets: Normalizer = "softmax"
+    imitation: Imitation | str = "squared"
+    target_training: TargetTraining | str = "imitation"
+    mask_supervision: bool = False
     stop_targets: bool = True
     stop_weights: bool = False
     uniform_floor: float = 0.0
@@ -94,11 +114,19 @@ class LossConfig:
             "loss_weighting",
             "regularization",
             "learned_targets",
+            "mask_supervision",
             "stop_targets",
             "stop_weights",
         ):
             check_choice(name, getattr(self, name), (True, False))
         check_choice("fixed_targets", self.fixed_targets, get_args(Normalizer))
+        check_choice("imitation", self.imitation, get_args(Imitation))
+        check_choice("target_training", self.target_training, get_args(TargetTraining))
+        if self.target_training == "held_out" and not self.learned_targets:
+            raise ValueError(
+                "target_training='held_out': expected learned_targets=True with it; fixed targets "
+                "are not trained"
+            )
         for name in ("uniform_floor", "label_smoothing"):
             check_number(name, getattr(self, name), 0.0, 1.0, fix="it is a share")
         for name in ("loss_weighting", "regularization"):
@@ -164,6 +192,50 @@ def loss_targets(
     return jax.nn.softmax(-losses / tau, axis=-1)
 
 
+def distance_to_targets(
+    weights: Float[Array, "b k"], targets: Float[Array, "b k"], form: Imitation | str = "squared"
+) -> Float[Array, " b"]:
+    r"""How far the fusion weights of each example lie from their targets.
+
+    .. math::
+        \text{squared:} \; \sum_k (w_k - t_k)^2 \qquad
+        \text{kl:} \; \sum_k \bar t_k \log \frac{\bar t_k}{w_k}, \;
+        \bar t_k = \frac{t_k}{\sum_j t_j}
+
+    The squared distance of weights that are nearly equal has hardly a gradient; the divergence
+    has.
+
+    Source: Shim (2020), Eq. 3.1, for `"squared"`. Deviation: `"kl"`.
+
+    Example:
+        >>> w, t = jnp.array([[0.5, 0.5]]), jnp.array([[1.0, 0.0]])
+        >>> distance_to_targets(w, t).tolist()
+        [0.5]
+    """
+    check_choice("form", form, get_args(Imitation))
+    if form == "squared":
+        return jnp.sum((weights - targets) ** 2, axis=-1)
+    tiny = jnp.asarray(1e-6, targets.dtype)
+    share = (targets + tiny) / jnp.sum(targets + tiny, axis=-1, keepdims=True)
+    return jnp.sum(share * (jnp.log(share) - jnp.log(weights + tiny)), axis=-1)
+
+
+def mask_penalty(weights: Float[Array, "b k"], failed: Bool[Array, "b k"]) -> Float[Array, " b"]:
+    r"""Cross entropy of the fusion weights with equal shares of the sensors that work.
+
+    .. math:: -\sum_k o_k \log w_k, \qquad o_k = \frac{1 - m_k}{\sum_j (1 - m_j)}
+
+    Honest wherever failures are simulated in training, since the mask is known there; nothing of it
+    is read at inference.
+
+    Example:
+        >>> w, failed = jnp.array([[0.5, 0.5]]), jnp.array([[True, False]])
+        >>> round(float(mask_penalty(w, failed)[0]), 4)
+        0.6931
+    """
+    return -jnp.sum(oracle_weights(failed) * jnp.log(weights + 1e-6), axis=-1)
+
+
 def gate_penalty(
     config: LossConfig,
     params: LossParams,
@@ -219,7 +291,7 @@ def gate_penalty(
         fixed = loss_targets(given, config.fixed_targets, params.tau)
         target = fixed if targets is None else targets
         share = jnp.ones(weights.shape[:1]) if counted is None else counted
-        regularization = jnp.mean(share * jnp.sum((weights - target) ** 2, axis=-1))
+        regularization = jnp.mean(share * distance_to_targets(weights, target, config.imitation))
         if targets is not None:
             anchor = jnp.mean(share * jnp.sum((targets - fixed) ** 2, axis=-1))
     total = params.alpha * auxiliary + params.beta * regularization + params.anchor * anchor

@@ -28,6 +28,8 @@ from fusion.gating import (
     embrace,
     oracle_weights,
 )
+from fusion.neighbours import EPSILON, Memory, neighbour_probabilities, read_memory
+from fusion.tables import TableEncoder
 from fusion.targets import init_targets
 
 Params = dict[str, Any]
@@ -58,6 +60,8 @@ class FusionNet(nn.Module):
         key: Array | None = None,
         failed: Bool[Array, "b k"] | None = None,
         available: Bool[Array, "b k"] | None = None,
+        memory: Memory | None = None,
+        excluded: Bool[Array, "b m"] | None = None,
     ) -> MainOutput:
         """Run the network.
 
@@ -66,15 +70,20 @@ class FusionNet(nn.Module):
             key: PRNG key in training (dropout, random fusion); None at inference.
             failed: which sensors failed; read by the oracle gate only.
             available: which sensors are there, see `predict`; all of them when None.
+            memory: training rows that a neighbourhood head compares with.
+            excluded: rows of the memory that an example may not see.
         """
         config, recipe = self.config, self.config.recipe
         b, k, t = x.shape
-        features = encoder(config.encoder, t, "encoder")(jnp.transpose(x, (1, 0, 2)))
+        encode = encoder(config.encoder, t, "encoder")
+        features = encode(jnp.transpose(x, (1, 0, 2)))
         if available is not None:
             features = jnp.where(available.T[:, :, None], features, jnp.zeros_like(features))
         weights = jnp.full((b, k), 1.0 / k, x.dtype)
         if recipe.gate == "learned":
-            weights = Gate(config.gate_width, config.normalizer, name="gate")(features)
+            weights = Gate(config.gate_width, config.normalizer, config.own_scores, name="gate")(
+                features
+            )
         elif recipe.gate == "oracle":
             if failed is None:
                 raise ValueError(
@@ -99,6 +108,20 @@ class FusionNet(nn.Module):
             h = nn.Dense(width, name=f"head{layer}")(h)
             if layer < len(config.head_widths):
                 h = nn.relu(h)
+        if config.head == "neighbourhood":
+            sharpness = jnp.exp(self.param("log_sharpness", nn.initializers.zeros, ()))
+            if memory is not None:
+                sharpness = sharpness * (config.sharpening if excluded is None else 1.0)
+                shares = neighbour_probabilities(
+                    features[..., :-1],
+                    weights,
+                    cast(TableEncoder, encode).recall(memory.rows),
+                    memory.labels,
+                    config.n_classes,
+                    sharpness,
+                    excluded=excluded,
+                )
+                h = h + jnp.log(shares + EPSILON)
         return MainOutput(h, weights, features)
 
 
@@ -154,6 +177,7 @@ def predict(
     failed: Bool[Array, "b k"] | None = None,
     *,
     available: Bool[Array, "b k"] | None = None,
+    excluded: Bool[Array, "b m"] | None = None,
     key: Key[Array, ""] | None = None,
 ) -> MainOutput:
     """Run the main model; no auxiliary parameter is read.
@@ -169,6 +193,8 @@ def predict(
         x: windows, `[batch, sensor, time]`, scaled to [-1, 1].
         failed: which sensors failed; the oracle gate reads it, the other models are not told.
         available: False for sensors that sent nothing; all are there when None.
+        excluded: rows of the memory that an example may not see, such as itself in training
+            (neighbourhood head only).
         key: PRNG key of dropout and random fusion, in training only.
 
     Returns:
@@ -198,8 +224,15 @@ def predict(
         available = there if available is None else available & there
     if available is not None:
         x = jnp.where(available[:, :, None], x, jnp.zeros_like(x))
+    main, memory = read_memory(main)
+    if config.head == "neighbourhood" and memory is None:
+        raise ValueError(
+            "main=parameters without a memory: expected the rows that head='neighbourhood' "
+            "compares with; take export(state.params) of a trained network"
+        )
     net = FusionNet(config)
-    return cast(MainOutput, net.apply({"params": main}, x, key, failed, available))
+    given = x, key, failed, available, memory, excluded
+    return cast(MainOutput, net.apply({"params": main}, *given))
 
 
 def check_windows(config: ModelConfig, x: Any) -> None:
@@ -227,7 +260,12 @@ def auxiliary_logits(
 
 
 def export(params: Params) -> Params:
-    """What inference needs: the main model's parameters, without auxiliary paths and lattice."""
+    """What inference needs: the main model's parameters, without auxiliary paths and lattice.
+
+    A network with a neighbourhood head needs its memory, too: clean training rows.
+    """
+    if "memory" in params:
+        return params["main"] | {"memory": params["memory"]}
     return params["main"]
 
 

@@ -8,9 +8,10 @@ from typing import Any, NamedTuple
 from fusion._checks import check_choice
 from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
-from fusion.encoders import EncoderConfig, reading_levels
+from fusion.encoders import EncoderConfig, reading_levels, readings_recur
 from fusion.losses import LossParams
 from fusion.models import match_parameters
+from fusion.tables import BINS, reading_ranks
 
 
 class Preset(NamedTuple):
@@ -34,6 +35,23 @@ _DRIVER = Preset(
     TrainConfig(epochs=8, batch_size=128),
     HyperParams(4e-3, 1e-4, LossParams(alpha=1.0, beta=1.0, tau=0.5, anchor=0.3)),
 )
+# The same rows with a head that compares with training rows, the driver's setting of record.
+_NEIGHBOURS = Preset(
+    ModelConfig(
+        n_times=1,
+        encoder=EncoderConfig(features=11, scalar="table"),
+        gate_width=64,
+        own_scores=True,
+        head_widths=(128, 128),
+        aux_width=16,
+        dropout=0.0,
+        head="neighbourhood",
+        memory_rows=2048,
+        sharpening=3.0,
+    ),
+    TrainConfig(epochs=3, batch_size=256),
+    HyperParams(1e-2, 0.0, LossParams(alpha=0.1, beta=0.3, tau=0.5, anchor=0.3)),
+)
 # Small enough for demo, tests and CI.
 _SIMULATED = Preset(
     ModelConfig(
@@ -45,25 +63,45 @@ _SIMULATED = Preset(
     TrainConfig(epochs=40, batch_size=32),
     HyperParams(5e-3, 1e-4, LossParams(alpha=1.0, beta=1.0, tau=0.5, anchor=0.3)),
 )
-_BY_DATASET = {"har": _HAR, "driver": _DRIVER, "simulated": _SIMULATED}
+# The same without training rows at inference, for those who cannot ship them.
+_EMBEDDING = _NEIGHBOURS._replace(
+    model=dataclasses.replace(_NEIGHBOURS.model, head="dense", head_widths=(256, 128))
+)
+_BY_DATASET = {
+    ("har", "dense"): _HAR,
+    ("driver", "neighbourhood"): _NEIGHBOURS,
+    ("driver", "embedding"): _EMBEDDING,
+    ("driver", "dense"): _DRIVER,
+    ("simulated", "dense"): _SIMULATED,
+    # One's own windows of unknown size: the small network, more room in its encoders.
+    ("own", "dense"): _SIMULATED._replace(
+        model=dataclasses.replace(_SIMULATED.model, encoder=EncoderConfig(features=32))
+    ),
+}
+"""(data set, head); the first of a data set is its default."""
 # Equal weights in the alpha term; classes of HAR overlap, so its labels are smoothed.
 _LOSS: dict[str, dict[str, Any]] = {
     "har": {"uniform_floor": 1.0, "label_smoothing": 0.05},
     "driver": {"uniform_floor": 1.0, "label_smoothing": 0.0},
     "simulated": {"uniform_floor": 1.0, "label_smoothing": 0.0},
+    "own": {"uniform_floor": 1.0, "label_smoothing": 0.0},
 }
-_QUICK_EPOCHS = {"har": 5, "driver": 2, "simulated": 15}
+_QUICK_EPOCHS = {"har": 5, "driver": 1, "simulated": 15, "own": 15}
 
 PRESETS = ("quick", "paper")
 
 
-def preset(dataset: Dataset, model: str = "argate_l", name: str = "paper") -> Preset:
+def preset(
+    dataset: Dataset, model: str = "argate_l", name: str = "paper", *, head: str | None = None
+) -> Preset:
     """Network and training of record for a data set, its size matched to that of ARGate-L.
 
     Args:
         dataset: gives the sizes.
         model: a name in `fusion.config.MODELS`.
         name: `"paper"` for the record, `"quick"` for the same with few epochs.
+        head: `"dense"`; for the driver data also `"neighbourhood"` (its default), which compares
+            with training rows, and `"embedding"`, the same encoders without them.
 
     Returns:
         Model, training and hyper-parameters; change fields with `dataclasses.replace` and
@@ -74,12 +112,16 @@ def preset(dataset: Dataset, model: str = "argate_l", name: str = "paper") -> Pr
     """
     check_choice("preset", name, PRESETS)
     check_choice("model", model, MODELS)
-    if dataset.name not in _BY_DATASET:
+    heads = [of for data, of in _BY_DATASET if data == dataset.name]
+    if not heads:
+        names = ", ".join(dict.fromkeys(data for data, _ in _BY_DATASET))
         raise ValueError(
-            f"dataset.name={dataset.name!r}: expected one of {', '.join(_BY_DATASET)}, which have "
+            f"dataset.name={dataset.name!r}: expected one of {names}, which have "
             "presets; build ModelConfig, TrainConfig and HyperParams yourself"
         )
-    base = _BY_DATASET[dataset.name]
+    head = heads[0] if head is None else head
+    check_choice("head", head, heads)
+    base = _BY_DATASET[dataset.name, head]
     reference = dataclasses.replace(
         base.model,
         model="argate_l",
@@ -88,12 +130,23 @@ def preset(dataset: Dataset, model: str = "argate_l", name: str = "paper") -> Pr
         n_classes=dataset.n_classes,
     )
     if dataset.n_time == 1:
-        encoder = dataclasses.replace(base.model.encoder, levels=reading_levels(dataset.train_x))
+        encoder = base.model.encoder
+        if encoder.scalar == "table":
+            levels = reading_levels(dataset.train_x, limit=4 * BINS)
+            ranks = reading_ranks(dataset.train_x, levels)
+            encoder = dataclasses.replace(encoder, levels=levels, ranks=ranks)
+        elif dataset.name != "own" or readings_recur(dataset.train_x):
+            encoder = dataclasses.replace(encoder, levels=reading_levels(dataset.train_x))
         reference = dataclasses.replace(reference, encoder=encoder)
     config = match_parameters(dataclasses.replace(reference, model=model), reference)
-    loss = dataclasses.replace(MODELS[model].loss, **_LOSS[dataset.name])
-    config = dataclasses.replace(config, loss=loss)
-    train = base.train
+    train, hyper = base.train, base.hyper
+    if MODELS[model].printed:
+        config = dataclasses.replace(config, normalizer="softmax_sigmoid")
+        hyper = hyper._replace(loss=hyper.loss._replace(anchor=0.0))
+    else:
+        loss = dataclasses.replace(MODELS[model].loss, **_LOSS[dataset.name])
+        config = dataclasses.replace(config, loss=loss)
     if name == "quick":
-        train = dataclasses.replace(train, epochs=_QUICK_EPOCHS[dataset.name])
-    return Preset(config, train, base.hyper)
+        epochs = min(train.epochs, _QUICK_EPOCHS[dataset.name])
+        train = dataclasses.replace(train, epochs=epochs)
+    return Preset(config, train, hyper)

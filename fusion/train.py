@@ -14,12 +14,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from fusion._checks import check_choice, check_count, check_key
+from fusion._checks import check_count, check_key
+from fusion.bilevel import held_out_gradient
 from fusion.config import HyperParams, ModelConfig, TrainConfig
-from fusion.failure_kinds import FAILURE_KINDS, FailureKind
+from fusion.failure_kinds import Kinds, check_kinds
 from fusion.failures import Protocol, corrupt
-from fusion.losses import LossTerms, argate_loss, cross_entropy
-from fusion.models import MainOutput, Params, auxiliary_logits, init, predict
+from fusion.losses import LossTerms, argate_loss, cross_entropy, mask_penalty
+from fusion.models import MainOutput, Params, auxiliary_logits, export, init, predict
+from fusion.neighbours import remember
 from fusion.targets import apply_targets, project_targets
 
 
@@ -44,10 +46,51 @@ def _optimizer(config: TrainConfig) -> optax.GradientTransformation:
     return optax.chain(optax.clip_by_global_norm(config.clip_norm), optax.scale_by_adam())
 
 
-def init_state(key: Key[Array, ""], model: ModelConfig, config: TrainConfig) -> TrainState:
-    """Fresh parameters and optimizer state."""
+def init_state(
+    key: Key[Array, ""],
+    model: ModelConfig,
+    config: TrainConfig,
+    clean: tuple[Float[Array, "n k t"], Int[Array, " n"]] | None = None,
+) -> TrainState:
+    """Fresh parameters and optimizer state.
+
+    Args:
+        key: of the parameters.
+        model, config: static.
+        clean: training rows and classes, which a neighbourhood head remembers.
+
+    Raises:
+        ValueError: a neighbourhood head without rows.
+    """
     params = init(key, model)
-    return TrainState(params, _optimizer(config).init(params), jnp.zeros((), jnp.int32))
+    state = TrainState(params, _optimizer(config).init(params), jnp.zeros((), jnp.int32))
+    if model.head != "neighbourhood":
+        return state
+    if clean is None:
+        raise ValueError(
+            "clean=None: expected the training rows that head='neighbourhood' remembers; give them"
+        )
+    # Shuffled, so that a block of it is a random part of it; `number` is the row's place.
+    order = jax.random.permutation(jax.random.fold_in(key, 3), len(clean[1]))
+    held = remember(model.encoder.levels, *clean)
+    memory = {"rows": held.rows[order], "labels": held.labels[order], "number": order}
+    return state._replace(params=params | {"memory": memory})
+
+
+def _without_memory(params: Params) -> Params:
+    """What is trained."""
+    return {part: tree for part, tree in params.items() if part != "memory"}
+
+
+def _recalled(
+    model: ModelConfig, memory: Params, *, key: Key[Array, ""]
+) -> tuple[Params, Int[Array, " m"]]:
+    """The part of the memory that a step compares with, and the numbers of its rows."""
+    n = memory["labels"].shape[0]
+    start = jax.random.randint(key, (), 0, n)
+    index = (start + jnp.arange(min(model.memory_rows, n))) % n
+    seen = {"rows": memory["rows"][index], "labels": memory["labels"][index]}
+    return {"memory": seen}, memory["number"][index]
 
 
 def batch_loss(
@@ -58,13 +101,14 @@ def batch_loss(
     y: Int[Array, " b"],
     failed: Bool[Array, "b k"],
     *,
+    excluded: Bool[Array, "b m"] | None = None,
     key: Key[Array, ""] | None = None,
 ) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
     """The training loss of one batch, with its terms and the main model's output.
 
     Differentiable in `params` and in `hyper.loss`; see `fusion.losses.argate_loss`.
     """
-    out = predict(model, params["main"], x, failed, key=key)
+    out = predict(model, export(params), x, failed, excluded=excluded, key=key)
     aux_losses = targets = None
     config = model.recipe.loss
     if config.auxiliary:
@@ -75,6 +119,9 @@ def batch_loss(
             given = jax.lax.stop_gradient(aux_losses) if config.stop_targets else aux_losses
             targets = apply_targets(model.targets, params["targets"], given)
     loss = argate_loss(config, hyper.loss, out.logits, y, out.weights, aux_losses, targets)
+    if config.mask_supervision:
+        told = jnp.mean(mask_penalty(out.weights, failed))
+        loss = loss._replace(total=loss.total + hyper.loss.mask * told)
     return loss.total, (loss, out)
 
 
@@ -88,6 +135,7 @@ def train_step(
     y: Int[Array, " b"],
     failed: Bool[Array, "b k"],
     *,
+    rows: Int[Array, " b"] | None = None,
     key: Key[Array, ""],
 ) -> tuple[TrainState, EpochMetrics]:
     r"""One step of Adam with decoupled weight decay, then the projection of the lattice.
@@ -100,7 +148,9 @@ def train_step(
         state: parameters, optimizer state and step number.
         rate: the learning rate :math:`\eta` of this step.
         x, y, failed: the batch.
-        key: of dropout and jitter.
+        rows: their numbers among the training rows, so that a neighbourhood head leaves each
+            example out of its own neighbours.
+        key: of dropout, jitter and the rows that are compared with.
 
     Returns:
         The new state and the batch's metrics. Weight decay is not applied to the lattice, whose
@@ -110,19 +160,41 @@ def train_step(
         gain = jax.random.normal(jax.random.fold_in(key, 100), x.shape[:2])
         x = x * (1.0 + config.jitter * gain)[:, :, None]
 
-    def loss(params: Params) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
-        return batch_loss(model, hyper, params, x, y, failed, key=key)
+    trained, seen, excluded = _without_memory(state.params), {}, None
+    if "memory" in state.params:
+        seen, number = _recalled(model, state.params["memory"], key=jax.random.fold_in(key, 101))
+        mine = jnp.full(x.shape[:1], -1) if rows is None else rows
+        excluded = mine[:, None] == number[None, :]
 
-    (_, (terms, out)), grads = jax.value_and_grad(loss, has_aux=True)(state.params)
-    updates, opt_state = _optimizer(config).update(grads, state.opt_state, state.params)
+    def loss(params: Params) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
+        given = params | seen
+        return batch_loss(model, hyper, given, x, y, failed, excluded=excluded, key=key)
+
+    (_, (terms, out)), grads = jax.value_and_grad(loss, has_aux=True)(trained)
+    if model.recipe.loss.target_training == "held_out":
+
+        def terms_of(params: Params, batch: tuple[Array, ...]) -> LossTerms:
+            return batch_loss(model, hyper, params | seen, *batch[:3], excluded=batch[3])[1][0]
+
+        seen_by = jnp.zeros((len(y), 1), bool) if excluded is None else excluded
+        grads["targets"] = held_out_gradient(
+            lambda p, batch: terms_of(p, batch).total,
+            lambda p, batch: terms_of(p, batch).main,
+            trained,
+            (x, y, failed, seen_by),
+            rate,
+        )
+    updates, opt_state = _optimizer(config).update(grads, state.opt_state, trained)
     params: Params = {}
-    for part, tree in state.params.items():
+    for part, tree in trained.items():
         decay = 0.0 if part == "targets" else hyper.weight_decay
         params[part] = jax.tree.map(
             lambda p, u, d=decay: p - rate * (u + d * p), tree, updates[part]
         )
     if "targets" in params:
         params["targets"] = project_targets(model.targets, params["targets"])
+    if "memory" in state.params:
+        params["memory"] = state.params["memory"]
     n_failed = jnp.sum(failed)
     metrics = EpochMetrics(
         loss=terms,
@@ -177,9 +249,8 @@ def make_epoch(
             if config.schedule == "cosine":
                 phase = jnp.minimum(1.0, state.step.astype(jnp.float32) / total_steps)
                 rate = rate * 0.5 * (1.0 + jnp.cos(jnp.pi * phase))
-            return train_step(
-                model, config, hyper, state, rate, x[index], y[index], failed[index], key=key
-            )
+            batch = x[index], y[index], failed[index]
+            return train_step(model, config, hyper, state, rate, *batch, rows=index, key=key)
 
         state, metrics = jax.lax.scan(step, state, (order, jax.random.split(step_key, n_batches)))
         return state, jax.tree.map(jnp.mean, metrics)
@@ -210,7 +281,8 @@ def predict_batches(
     check_count("batch_size", batch_size)
     n = x.shape[0]
     mask = jnp.zeros(x.shape[:2], bool) if failed is None else failed
-    batch_size = min(batch_size, n)
+    # A neighbourhood head splits the work itself, and reads its memory once for all examples.
+    batch_size = n if model.head == "neighbourhood" else min(batch_size, n)
     n_chunks = -(-n // batch_size)
     padding = n_chunks * batch_size - n
 
@@ -231,7 +303,7 @@ def make_train(
     config: TrainConfig,
     n_examples: int,
     protocol: Protocol,
-    kind: FailureKind | str = "uniform",
+    kind: Kinds = "uniform",
     *,
     redraw: bool = True,
 ) -> Callable[..., tuple[TrainState, EpochMetrics]]:
@@ -248,7 +320,7 @@ def make_train(
     Raises:
         ValueError: an unknown kind, a protocol for another number of sensors, too few examples.
     """
-    check_choice("kind", kind, FAILURE_KINDS)
+    check_kinds("kind", kind)
     if protocol.n_channels != model.n_sensors:
         raise ValueError(
             f"protocol.n_channels={protocol.n_channels}: expected {model.n_sensors}, the sensors "
@@ -268,6 +340,7 @@ def make_train(
             step_key = jax.random.fold_in(epoch_key, index)
             return epoch(hyper, state, noisy, y, failed, key=step_key)
 
-        return jax.lax.scan(body, init_state(init_key, model, config), jnp.arange(config.epochs))
+        start = init_state(init_key, model, config, (x, y))
+        return jax.lax.scan(body, start, jnp.arange(config.epochs))
 
     return train

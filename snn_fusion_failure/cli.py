@@ -13,6 +13,7 @@ COMMANDS = {
     "train-snn": "train_snn",
     "train-rl": "train_rl",
     "train-argate": "train_argate",
+    "watch-sensors": "watch_sensors",
     "simulate-kitti": "simulate_kitti",
     "train-detector": "train_detector",
     "evaluate-kitti": "evaluate_kitti",

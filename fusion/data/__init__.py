@@ -27,6 +27,7 @@ def load(
     *,
     download: bool = False,
     split: str | None = None,
+    features: str | None = None,
     seed: int = 0,
 ) -> Dataset:
     """Load a data set by name.
@@ -36,6 +37,7 @@ def load(
         data_dir: folder or file to look at first; then `$FUSION_DATA_DIR` and the user cache.
         download: fetch the set from its publisher when it is nowhere (`har` only).
         split: how test rows are taken, one of `DATASETS[name]`; None = the first of them.
+        features: which signals, see `load_driver` (`driver` only).
         seed: of the simulated values, or of the draw of the driver's test rows.
 
     Returns:
@@ -52,8 +54,13 @@ def load(
     check_choice("name", name, DATASETS)
     split = DATASETS[name][0] if split is None else split
     check_choice("split", split, DATASETS[name])
+    if features is not None and name != "driver":
+        raise ValueError(
+            f"features={features!r}: expected name='driver' with it, {name!r} has one list of "
+            "channels; leave it out"
+        )
     if name == "har":
         return load_har(data_dir, download=download)
     if name == "driver":
-        return load_driver(data_dir, split=split, seed=seed)
+        return load_driver(data_dir, split=split, features=features or "complete", seed=seed)
     return load_simulated(seed=seed)

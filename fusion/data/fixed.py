@@ -3,7 +3,11 @@
 from __future__ import annotations
 
 from fusion.data.dataset import Dataset
-from fusion.data.driver import DRIVER_CHANNELS, DRIVER_SOURCE_CHANNELS
+from fusion.data.driver import (
+    DRIVER_CHANNELS,
+    DRIVER_SOURCE_CHANNELS,
+    DRIVER_TAGGED_CHANNELS,
+)
 from fusion.failures import Protocol, fixed_failing
 
 # n_clean -> channels that fail. The text names three channels where four must fail and two where
@@ -38,7 +42,7 @@ def fixed_sets(dataset: Dataset) -> dict[int, tuple[str, ...]]:
     """
     if dataset.name == "har":
         return dict(HAR_FIXED_FAILING)
-    if dataset.channels in (DRIVER_CHANNELS, DRIVER_SOURCE_CHANNELS):
+    if dataset.channels in (DRIVER_CHANNELS, DRIVER_TAGGED_CHANNELS, DRIVER_SOURCE_CHANNELS):
         return {
             n: tuple(
                 name

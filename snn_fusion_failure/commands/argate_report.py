@@ -20,7 +20,7 @@ if TYPE_CHECKING:
 def printed(config: Config, noise: Corruption) -> float | None:
     """The source's accuracy for the same data set, model and failing sensors, in percent."""
     path = repository.RESULTS / "source_tables.json"
-    if config.split is not None or not path.exists():
+    if config.split is not None or config.features is not None or not path.exists():
         return None
     tables = json.loads(path.read_text(encoding="utf-8"))
     for number, (_, rows) in fusion_tables.TABLES.items():

@@ -28,9 +28,15 @@ class Config:
 
     dataset: str = "har"
     """har, driver or simulated."""
+    data: Path | None = None
+    """Your own windows instead: .npz with x [N, K, T] and y [N], optional groups, channels and
+    classes."""
     model: str = "argate_l"
-    """baseline, netgated, argate_ws, argate_plus, argate_l; or modality_dropout, embracenet,
-    oracle."""
+    """baseline, netgated, argate_ws, argate_plus, argate_l; argate_plus_printed, argate_l_printed
+    (the equations to the letter); or equal_weights, modality_dropout, embracenet, oracle."""
+    head: str | None = None
+    """dense; for driver also neighbourhood (its default: compares with training rows) and
+    embedding (the same encoders without them)."""
     preset: str = "paper"
     """paper (the settings of record) or quick (few epochs)."""
     protocol: ProtocolName | None = None
@@ -43,11 +49,14 @@ class Config:
     test_range: tuple[int, int] | None = None
     """Fewest and most failing sensors in test (generalisation); 3 8 when left out."""
     kind: str = "uniform"
-    """Failure kind: uniform, gaussian, zero, stuck, drift, dropout, gain, clip."""
+    """Failure kind: uniform, gaussian, zero, stuck, drift, dropout, gain, clip; or several with
+    commas, of which each example draws one."""
     redraw: bool = True
     """Draw the training noise anew in every epoch; --no-redraw draws it once (literal)."""
     split: str | None = None
     """How test rows are taken, e.g. trip for driver; the data set's default when left out."""
+    features: str | None = None
+    """Signals of driver: complete (its default), tagged (with one that names trips) or source."""
     validation: bool = False
     """Score on a held-out part of the training rows instead of the test rows."""
     epochs: int | None = None
@@ -60,6 +69,8 @@ class Config:
     """Temperature of the fixed targets."""
     normalizer: Literal["softmax", "softmax_sigmoid"] | None = None
     """Of the fusion weights and of the fixed targets; softmax_sigmoid is the printed one."""
+    mask_supervision: bool = False
+    """The gate also learns from the mask of the simulated failures."""
     changes: Annotated[tuple[str, ...], tyro.conf.arg(name="set")] = ()
     """Changed constants as part.name=value, parts model, train and hyper:
     `model.loss.uniform_floor=0 hyper.weight_decay=1e-4`."""
@@ -92,7 +103,7 @@ def build_settings(config: Config, dataset: Dataset) -> Preset:
     """Preset with the command line's changes, for a loaded data set."""
     from fusion.presets import Preset, preset
 
-    parts: dict[str, Any] = preset(dataset, config.model, config.preset)._asdict()
+    parts: dict[str, Any] = preset(dataset, config.model, config.preset, head=config.head)._asdict()
     named = {
         "train.epochs": config.epochs,
         "hyper.learning_rate": config.learning_rate,
@@ -103,6 +114,8 @@ def build_settings(config: Config, dataset: Dataset) -> Preset:
         "model.loss.fixed_targets": config.normalizer,
     }
     given = [f"{name}={value}" for name, value in named.items() if value is not None]
+    if config.mask_supervision:
+        given.append("model.loss.mask_supervision=true")
     return Preset(**apply_changes(parts, [*given, *config.changes]))
 
 
@@ -155,7 +168,9 @@ def build_cases(config: Config, dataset: Dataset) -> dict[str, Case]:
     made: dict[str, Case] = {}
     for name in names:
         train, test, title = _protocols(config, dataset, name)
-        noise = Corruption(train, test, config.kind, redraw=config.redraw)
+        kinds = tuple(config.kind.split(","))
+        kind = kinds if len(kinds) > 1 else config.kind
+        noise = Corruption(train, test, kind, redraw=config.redraw)
         made[name] = Case(title, noise)
     return made
 

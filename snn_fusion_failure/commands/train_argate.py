@@ -6,7 +6,8 @@ trains ARGate-L twice on smartphone activity windows, with all sensors working a
 replaced by noise in two thirds of the windows, and ends with both accuracies beside the source's,
 pictures, and a line `result: ...`: a minute and a half of CPU time. `--protocol` trains one case.
 `--preset quick` takes few epochs; the default `paper` has the settings of record. With
-`--dataset simulated` no data file is needed.
+`--dataset simulated` no data file is needed; `--data my.npz` takes your own windows: arrays `x`
+[N, K, T] and `y` [N], and if you like `groups` [N], `channels` [K] and `classes` [C].
 """
 
 from __future__ import annotations
@@ -95,7 +96,19 @@ def main(config: Config) -> dict[str, Any]:
     from fusion.data import load, validation_split
     from fusion.models import count_parameters
 
-    dataset = load(config.dataset, config.data_dir, download=config.download, split=config.split)
+    if config.data is not None:
+        from fusion.data.own_file import load_file
+
+        dataset = load_file(config.data)
+        config = dataclasses.replace(config, dataset=dataset.name)
+    else:
+        dataset = load(
+            config.dataset,
+            config.data_dir,
+            download=config.download,
+            split=config.split,
+            features=config.features,
+        )
     if config.validation:
         dataset = validation_split(dataset, seed=config.seed)
     settings, cases = build_settings(config, dataset), build_cases(config, dataset)

@@ -103,6 +103,11 @@ RULES = (
     # Chapter 3.
     Rule("train_argate.py simulated", "--epochs 1 --overwrite"),
     Rule("train_argate.py", "--epochs 1 --preset quick --overwrite"),
+    Rule("watch_sensors.py", "--preset quick --samples 80"),
+    Rule(
+        "study_sensors.py",
+        "--preset quick --seeds 1 --models argate_plus --rows zero --results runs",
+    ),
     Rule("study_argate.py", "--preset quick --models argate_ws"),
     Rule("bench_lattice.py", "--steps 2 --repeats 1"),
     Rule("simulate_kitti.py --picture", "--size tiny"),
@@ -220,7 +225,10 @@ AREAS = {
         "train_rl", "study_detour",
     ),
     "sweeps": ("sweep", "bench_sweep"),
-    "fusion": ("train_argate", "study_argate", "bench_fusion", "bench_lattice", "reproduce"),
+    "fusion": (
+        "train_argate", "watch_sensors", "study_argate", "study_sensors", "bench_fusion",
+        "bench_lattice", "reproduce",
+    ),
     "circuits": (
         "find_failures", "study_failures", "study_active", "study_circuits", "study_parity",
         "study_rare_events", "study_sigma", "bench_circuits", "bench_revnet", "bench_bo",

@@ -16,6 +16,7 @@ def make_data(folder: Path) -> None:
         DRIVER_CHANNELS,
         DRIVER_CLASSES,
         DRIVER_SOURCE_CHANNELS,
+        DRIVER_TAGGED_CHANNELS,
         N_ROWS,
         N_TRIPS,
         OIL,
@@ -34,7 +35,7 @@ def make_data(folder: Path) -> None:
     (folder / "har").mkdir(parents=True)
     np.savez(folder / "har" / "uci_har_inertial.npz", **arrays)
 
-    signals = sorted({*DRIVER_CHANNELS, *DRIVER_SOURCE_CHANNELS})
+    signals = sorted({*DRIVER_CHANNELS, *DRIVER_TAGGED_CHANNELS, *DRIVER_SOURCE_CHANNELS})
     # Two trips for each driver, then one more each for as long as there are trips.
     drivers = [DRIVER_CLASSES[i % len(DRIVER_CLASSES)] for i in range(N_TRIPS)]
     lengths = [N_ROWS // N_TRIPS + (i < N_ROWS % N_TRIPS) for i in range(N_TRIPS)]

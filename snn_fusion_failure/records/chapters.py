@@ -151,9 +151,9 @@ def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Done:
     ]
     # The source's models first, seed by seed over all tables: an early stop then leaves complete
     # tables of few seeds.
-    reference = fusion_tables.REFERENCES
     index, count = plan.shard
-    todo = sorted(todo, key=lambda run: (run.model in reference, run.seed))[index::count]
+    todo = sorted(todo, key=lambda run: (run.model not in fusion_tables.FIVE, run.seed))
+    todo = todo[index::count]
     todo = [] if plan.collect_only else [run for run in todo if not run.path(out).exists()]
     if todo:
         enable_compilation_cache()

@@ -12,13 +12,16 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from snn_fusion_failure.records.ceilings import CEILINGS, score
 from snn_fusion_failure.records.rows import summarize
 
 if TYPE_CHECKING:
     from fusion.failure_kinds import FailureKind
 
 FIVE = ("baseline", "netgated", "argate_ws", "argate_plus", "argate_l")
+PRINTED = ("argate_plus_printed", "argate_l_printed")
 REFERENCES = ("oracle", "modality_dropout", "embracenet")
+DRIVER_REFERENCES = ("equal_weights", *PRINTED, "oracle", *CEILINGS)
 UNSEEN_KINDS: tuple[FailureKind, ...] = ("zero", "stuck", "drift", "dropout", "gain", "clip")
 
 
@@ -29,7 +32,8 @@ class Row:
     Attributes:
         name: as the source's table spells it.
         settings: fields of `train_argate.Config` that differ from its defaults.
-        references: train the reference models on this row too.
+        references: train the reference models on this row too. `equal_weights` is the baseline of
+            the driver's neighbourhood head; `baseline` there has dense layers as in the source.
         robustness: also score under the failure kinds that are never trained on.
         channel: keep this channel's fusion weights (Figure 3.7).
     """
@@ -43,7 +47,14 @@ class Row:
 
 def _random(dataset: str, n_clean: int, kind: str, **options: Any) -> Row:
     settings = {"dataset": dataset, "protocol": "random", "n_clean": n_clean, "kind": kind}
-    return Row(f"n_clean={n_clean} {kind}", settings, **options)
+    references = options.pop("references", ())
+    if dataset == "har":
+        references = (*PRINTED, *references)
+    elif kind == "gaussian":  # the ceilings do not depend on how sensors fail
+        references = tuple(m for m in DRIVER_REFERENCES if m not in CEILINGS)
+    else:
+        references = DRIVER_REFERENCES
+    return Row(f"n_clean={n_clean} {kind}", settings, references, **options)
 
 
 def _ranges(dataset: str, train: tuple[int, int], test: tuple[int, int]) -> Row:
@@ -53,11 +64,14 @@ def _ranges(dataset: str, train: tuple[int, int], test: tuple[int, int]) -> Row:
         "train_range": train,
         "test_range": test,
     }
-    return Row(f"({train[0]},{train[1]})({test[0]},{test[1]})", settings)
+    references = ("equal_weights",) if dataset == "driver" else ()
+    return Row(f"({train[0]},{train[1]})({test[0]},{test[1]})", settings, references)
 
 
 def _fixed(dataset: str, n_clean: int) -> Row:
-    return Row(f"n_clean={n_clean}", {"dataset": dataset, "protocol": "fixed", "n_clean": n_clean})
+    references = ("equal_weights", "forest_ceiling") if dataset == "driver" else ()
+    settings = {"dataset": dataset, "protocol": "fixed", "n_clean": n_clean}
+    return Row(f"n_clean={n_clean}", settings, references)
 
 
 TABLES: dict[str, tuple[str, tuple[Row, ...]]] = {
@@ -88,13 +102,17 @@ TABLES: dict[str, tuple[str, tuple[Row, ...]]] = {
     "3.5": (
         "Driver identification, clean and random failing sensor assignment, accuracy %",
         (
-            Row("clean", {"dataset": "driver", "protocol": "clean"}),
-            _random("driver", 12, "uniform", references=("oracle",)),
+            Row(
+                "clean",
+                {"dataset": "driver", "protocol": "clean"},
+                ("equal_weights", "forest_ceiling"),
+            ),
+            _random("driver", 12, "uniform"),
             _random("driver", 12, "gaussian"),
-            _random("driver", 8, "uniform", references=REFERENCES, robustness=True),
+            _random("driver", 8, "uniform"),
             _random("driver", 8, "gaussian"),
-            _random("driver", 5, "uniform", references=REFERENCES),
-            _random("driver", 5, "gaussian", references=("oracle",)),
+            _random("driver", 5, "uniform"),
+            _random("driver", 5, "gaussian"),
         ),
     ),
     "3.6": (
@@ -144,7 +162,17 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
         train_and_test,
     )
 
-    config = Config(model=run.model, preset=preset, seed=run.seed, **run.row.settings)
+    if run.model in CEILINGS:
+        (case,) = build_cases(Config(**run.row.settings), dataset).values()
+        return score(run.model, dataset, case.noise, run.seed)
+    dense = run.model == "baseline" and dataset.name == "driver"
+    config = Config(
+        model=run.model,
+        preset=preset,
+        seed=run.seed,
+        head="dense" if dense else None,
+        **run.row.settings,
+    )
     settings = build_settings(config, dataset)
     (case,) = build_cases(config, dataset).values()
     fitted, output = train_and_test(settings, dataset, case.noise, run.seed)
@@ -153,6 +181,10 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
         "epochs": settings.train.epochs,
         "train_loss": fitted.history[-1]["total"],
     }
+    if dataset.name == "har":
+        right = 100.0 * (output.labels == output.logits.argmax(-1))
+        groups = np.unique(dataset.test_group)
+        record["subjects"] = [float(right[dataset.test_group == g].mean()) for g in groups]
     if run.row.robustness and run.model != "oracle":
         record["robustness"], key = {}, jax.random.key(run.seed)
         for kind in UNSEEN_KINDS:
@@ -212,7 +244,7 @@ def collect(
     import numpy as np
 
     from fusion import evaluate
-    from snn_fusion_failure.records.statistics import paired_test
+    from snn_fusion_failure.records.statistics import holm, paired_test, two_way_interval
 
     held = load_runs(table, out, seeds)
     printed = source[table]
@@ -221,7 +253,7 @@ def collect(
     for (row, model), by_seed in held.items():
         order = sorted(by_seed)
         for metric in METRICS:
-            values = [by_seed[s][metric] for s in order]
+            values = [by_seed[s].get(metric) for s in order]
             if any(v is None for v in values):
                 continue
             unit = "%" if metric.startswith("accuracy") else "1"
@@ -232,6 +264,8 @@ def collect(
             rows.append(cell)
     for row in dict.fromkeys(name for name, _ in held):
         pairs = [("argate_plus", "baseline"), ("argate_l", "argate_plus"), ("argate_l", "baseline")]
+        pairs += [(m, "equal_weights") for m in ("netgated", "argate_plus", "argate_l")]
+        pairs += [("argate_plus", "argate_plus_printed"), ("argate_l", "argate_l_printed")]
         for better, worse in pairs:
             a, b = held.get((row, better), {}), held.get((row, worse), {})
             common = sorted(set(a) & set(b))
@@ -240,10 +274,18 @@ def collect(
             test = paired_test(
                 [a[s]["accuracy"] for s in common], [b[s]["accuracy"] for s in common]
             )
-            studies.append({"row": row, "comparison": f"{better} - {worse}", **test._asdict()})
+            found = {"row": row, "comparison": f"{better} - {worse}", **test._asdict()}
+            if all("subjects" in t[s] for t in (a, b) for s in common):
+                differences = [
+                    np.subtract(a[s]["subjects"], b[s]["subjects"]).tolist() for s in common
+                ]
+                found["over_subjects_and_seeds"] = list(two_way_interval(differences))
+            studies.append(found)
         oracle = held.get((row, "oracle"), {})
+        # The gap is that to the baseline with the same head.
+        base = held.get((row, "equal_weights")) or held.get((row, "baseline"), {})
         for model in FIVE[1:]:
-            three = [held.get((row, model), {}), held.get((row, "baseline"), {}), oracle]
+            three = [held.get((row, model), {}), base, oracle]
             common = sorted(set(three[0]) & set(three[1]) & set(three[2]))
             if common:
                 values = [[t[s]["accuracy"] for s in common] for t in three]
@@ -256,4 +298,7 @@ def collect(
                         "value": gap,
                     }
                 )
+    tests = [study for study in studies if "p_value" in study]
+    for study, p in zip(tests, holm([t["p_value"] for t in tests]), strict=True):
+        study["p_holm"] = p
     return rows, studies

@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import contextlib
 import sys
+from collections.abc import Callable, Iterator
 from typing import Any
 
 
@@ -40,3 +42,14 @@ def fail(message: str) -> None:
     """Say what is wrong on stderr and leave with exit status 2."""
     print(f"error: {message}", file=sys.stderr)
     raise SystemExit(2)
+
+
+@contextlib.contextmanager
+def live_text() -> Iterator[Callable[[str], None]]:
+    """A block of text in the terminal that is drawn over again: `with live_text() as show`."""
+    from rich.console import Console
+    from rich.live import Live
+    from rich.text import Text
+
+    with Live(console=Console(stderr=True), refresh_per_second=20) as live:
+        yield lambda text: live.update(Text(text))

@@ -17,13 +17,14 @@ from fusion.data.driver import (
     DRIVER_CLASSES,
     DRIVER_REPLACEMENTS,
     DRIVER_SOURCE_CHANNELS,
+    DRIVER_TAGGED_CHANNELS,
     load_driver,
 )
 from fusion.data.fixed import fixed_sets, published_fixed
 
 N_SECONDS = 12
 TRIPS = [*DRIVER_CLASSES, *DRIVER_CLASSES, *DRIVER_CLASSES, "B", "D"]
-SIGNALS = sorted(set(DRIVER_CHANNELS) | set(DRIVER_SOURCE_CHANNELS))
+SIGNALS = sorted({*DRIVER_CHANNELS, *DRIVER_TAGGED_CHANNELS, *DRIVER_SOURCE_CHANNELS})
 
 
 def published_name(name: str) -> str:

@@ -245,3 +245,17 @@ def test_one_trace_and_vmap_equals_loop() -> None:
 def test_bad_input_is_refused_before_anything_is_compiled(make, expected: str) -> None:
     with pytest.raises(ValueError, match=expected):
         make()
+
+
+def test_a_mixture_gives_every_example_one_of_its_kinds() -> None:
+    """Clean readings are 0.5, which neither kind gives."""
+    x = jnp.full((60, 2, 4), 0.5)
+    failed = jnp.ones((60, 2), bool)
+    key = jax.random.key(0)
+    mixed = np.asarray(apply_failure(x, failed, ("zero", "gain"), key=key))
+    zero = (mixed == 0.0).all(axis=(1, 2))
+    assert 15 < zero.sum() < 45
+    assert ((mixed[~zero] != 0.0) & (mixed[~zero] != 0.5)).all()
+    for kinds in ((), ("zero", "zero"), ("zero", "sticky")):
+        with pytest.raises(ValueError, match="kind="):
+            apply_failure(x, failed, kinds, key=key)

@@ -12,8 +12,10 @@ from scipy import stats
 
 from snn_fusion_failure.records.statistics import (
     bootstrap_interval,
+    holm,
     mean_interval,
     paired_test,
+    two_way_interval,
 )
 
 
@@ -61,3 +63,19 @@ def test_bootstrap_redraws_whole_groups() -> None:
     assert bootstrap_interval([1.0, 1.0]).high == 1.0
     with pytest.raises(ValueError, match=r"groups=.*expected at least two"):
         bootstrap_interval([1.0, 0.0], [3, 3])
+
+
+def test_adjusted_p_values_are_those_of_a_worked_example() -> None:
+    """Four tests; by hand: 4 x 0.01, then 3 x 0.02 and 2 x 0.04 and never falling."""
+    assert holm([0.04, 0.01, 0.9, 0.02]) == pytest.approx([0.08, 0.04, 0.9, 0.06])
+    assert holm([0.03, 0.031]) == pytest.approx([0.06, 0.06])
+    assert holm([]) == []
+
+
+def test_the_interval_over_seeds_and_subjects_is_wider_than_over_seeds() -> None:
+    """Subjects differ by several points, seeds hardly."""
+    rng = np.random.default_rng(0)
+    table = rng.normal(0.0, 3.0, 9)[None, :] + rng.normal(0.0, 0.1, (5, 9))
+    low, high = two_way_interval(table)
+    assert low < table.mean() < high
+    assert high - low > 5.0 * np.ptp(table.mean(axis=1))

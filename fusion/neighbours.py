@@ -1,0 +1,114 @@
+"""A head that remembers: classes of the training rows that lie near in the sensors that count.
+
+Source: Goldberger et al. (2004), Neighbourhood components analysis, for learning from leave-one-out
+soft neighbours; the fusion weights inside the distance are ours.
+"""
+
+from __future__ import annotations
+
+from typing import Any, NamedTuple
+
+import jax
+import jax.numpy as jnp
+from jaxtyping import Array, Bool, Float, Int
+
+from fusion.tables import codes
+
+EPSILON = 1e-3
+"""Probability that every class keeps, so that its logarithm is bounded."""
+CHUNK = 128
+"""Examples that are compared with the whole memory at once; bounds what has to be held."""
+
+
+class Memory(NamedTuple):
+    """Clean training rows: rows of the tables `[m, sensor]` and classes `[m]`."""
+
+    rows: Int[Array, "m k"]
+    labels: Int[Array, " m"]
+
+
+def remember(
+    levels: tuple[tuple[float, ...], ...], x: Float[Array, "m k 1"], y: Int[Array, " m"]
+) -> Memory:
+    """The memory of clean training rows.
+
+    Args:
+        levels: `EncoderConfig.levels`.
+        x: clean rows scaled to [-1, 1]; y: their classes.
+    """
+    rows, _ = codes(levels, jnp.asarray(x)[:, :, 0].T)
+    return Memory(rows.T, jnp.asarray(y, jnp.int32))
+
+
+def neighbour_probabilities(
+    features: Float[Array, "k b g"],
+    weights: Float[Array, "b k"],
+    remembered: Float[Array, "k m g"],
+    labels: Int[Array, " m"],
+    n_classes: int,
+    sharpness: Float[Array, ""],
+    *,
+    excluded: Bool[Array, "b m"] | None = None,
+) -> Float[Array, "b c"]:
+    r"""Share of each class among the soft neighbours of each example.
+
+    .. math::
+        d(x, x') = \sum_k K w_k(x)\, \lVert e_k(x_k) - e_k(x'_k) \rVert^2, \qquad
+        p(c \mid x) \propto \sum_{i:\, y_i = c} e^{-s\, d(x, x_i)}
+
+    A sensor of weight zero has no influence at all.
+
+    Args:
+        features: :math:`e_k(x_k)`.
+        weights: fusion weights :math:`w_k`.
+        remembered: features of the rows in memory.
+        labels: their classes.
+        n_classes: static.
+        sharpness: s, > 0.
+        excluded: rows that an example may not see, such as itself in training.
+
+    Returns:
+        Probabilities; rows sum to one.
+    """
+    k, b, g = features.shape
+    m = remembered.shape[1]
+    gain = k * weights
+    # -s d without the part that is the same for all rows in memory.
+    query = jnp.concatenate(
+        [
+            2.0 * jnp.transpose(features * gain.T[:, :, None], (1, 0, 2)).reshape(b, k * g),
+            -gain,
+        ],
+        axis=1,
+    )
+    known = jnp.concatenate(
+        [
+            jnp.transpose(remembered, (1, 0, 2)).reshape(m, k * g),
+            jnp.sum(remembered**2, axis=-1).T,
+        ],
+        axis=1,
+    )
+    classes = jax.nn.one_hot(labels, n_classes, dtype=features.dtype)
+
+    def shares(query: Array, excluded: Array | None) -> Array:
+        score = sharpness * (query @ known.T)
+        if excluded is not None:
+            score = jnp.where(excluded, jnp.finfo(score.dtype).min, score)
+        top = jax.lax.stop_gradient(jnp.max(score, axis=-1, keepdims=True))
+        found = jnp.exp(score - top) @ classes
+        return found / jnp.sum(found, axis=-1, keepdims=True)
+
+    if excluded is not None or b <= 2 * CHUNK:
+        return shares(query, excluded)
+    count = -(-b // CHUNK)
+    padded = jnp.pad(query, ((0, count * CHUNK - b), (0, 0)))
+    found = jax.lax.map(lambda q: shares(q, None), padded.reshape(count, CHUNK, -1))
+    return found.reshape(-1, n_classes)[:b]
+
+
+def read_memory(main: dict[str, Any]) -> tuple[dict[str, Any], Memory | None]:
+    """Parameters without the memory, and the memory where there is one."""
+    if "memory" not in main:
+        return main, None
+    rest = {name: value for name, value in main.items() if name != "memory"}
+    return rest, Memory(main["memory"]["rows"], main["memory"]["labels"])

@@ -10,7 +10,7 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Int
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from fusion.tables import codes
 
@@ -112,3 +112,18 @@ def read_memory(main: dict[str, Any]) -> tuple[dict[str, Any], Memory | None]:
         return main, None
     rest = {name: value for name, value in main.items() if name != "memory"}
     return rest, Memory(main["memory"]["rows"], main["memory"]["labels"])
+
+
+def recall(
+    size: int, memory: dict[str, Array], *, key: Key[Array, ""]
+) -> tuple[dict[str, Any], Int[Array, " m"]]:
+    """The part of the memory that a training step compares with, and the numbers of its rows.
+
+    The memory is shuffled (`fusion.train.init_state`), so a block at a random place is a random
+    part of it.
+    """
+    n = memory["labels"].shape[0]
+    start = jax.random.randint(key, (), 0, n)
+    index = (start + jnp.arange(min(size, n))) % n
+    seen = {"rows": memory["rows"][index], "labels": memory["labels"][index]}
+    return {"memory": seen}, memory["number"][index]

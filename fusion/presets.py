@@ -10,7 +10,7 @@ from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
 from fusion.encoders import EncoderConfig, reading_levels, readings_recur
 from fusion.losses import LossParams
-from fusion.models import match_parameters
+from fusion.sizes import match_parameters
 from fusion.tables import BINS, reading_ranks
 
 

@@ -14,14 +14,14 @@ import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
-from fusion._checks import check_count, check_key
+from fusion._checks import check_key
 from fusion.bilevel import held_out_gradient
 from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.failure_kinds import Kinds, check_kinds
 from fusion.failures import Protocol, corrupt
 from fusion.losses import LossTerms, argate_loss, cross_entropy, mask_penalty
 from fusion.models import MainOutput, Params, auxiliary_logits, export, init, predict
-from fusion.neighbours import remember
+from fusion.neighbours import recall, remember
 from fusion.targets import apply_targets, project_targets
 
 
@@ -80,17 +80,6 @@ def init_state(
 def _without_memory(params: Params) -> Params:
     """What is trained."""
     return {part: tree for part, tree in params.items() if part != "memory"}
-
-
-def _recalled(
-    model: ModelConfig, memory: Params, *, key: Key[Array, ""]
-) -> tuple[Params, Int[Array, " m"]]:
-    """The part of the memory that a step compares with, and the numbers of its rows."""
-    n = memory["labels"].shape[0]
-    start = jax.random.randint(key, (), 0, n)
-    index = (start + jnp.arange(min(model.memory_rows, n))) % n
-    seen = {"rows": memory["rows"][index], "labels": memory["labels"][index]}
-    return {"memory": seen}, memory["number"][index]
 
 
 def batch_loss(
@@ -162,7 +151,9 @@ def train_step(
 
     trained, seen, excluded = _without_memory(state.params), {}, None
     if "memory" in state.params:
-        seen, number = _recalled(model, state.params["memory"], key=jax.random.fold_in(key, 101))
+        seen, number = recall(
+            model.memory_rows, state.params["memory"], key=jax.random.fold_in(key, 101)
+        )
         mine = jnp.full(x.shape[:1], -1) if rows is None else rows
         excluded = mine[:, None] == number[None, :]
 
@@ -256,46 +247,6 @@ def make_epoch(
         return state, jax.tree.map(jnp.mean, metrics)
 
     return epoch
-
-
-def predict_batches(
-    model: ModelConfig,
-    main: Params,
-    x: Float[Array, "n k t"],
-    failed: Bool[Array, "n k"] | None = None,
-    *,
-    batch_size: int = 256,
-) -> tuple[Float[Array, "n c"], Float[Array, "n k"]]:
-    """Logits and fusion weights of many examples, by the exported main model, in chunks.
-
-    Args:
-        model: static.
-        main: `fusion.models.export(params)`; no auxiliary parameter is read.
-        x: windows.
-        failed: mask of failed sensors, read by the oracle gate only.
-        batch_size: examples per chunk; bounds the memory.
-
-    Returns:
-        (logits `[n, class]`, fusion weights `[n, sensor]`).
-    """
-    check_count("batch_size", batch_size)
-    n = x.shape[0]
-    mask = jnp.zeros(x.shape[:2], bool) if failed is None else failed
-    # A neighbourhood head splits the work itself, and reads its memory once for all examples.
-    batch_size = n if model.head == "neighbourhood" else min(batch_size, n)
-    n_chunks = -(-n // batch_size)
-    padding = n_chunks * batch_size - n
-
-    def chunked(a: Array) -> Array:
-        padded = jnp.concatenate([a, jnp.zeros((padding, *a.shape[1:]), a.dtype)])
-        return padded.reshape(n_chunks, batch_size, *a.shape[1:])
-
-    def chunk(inputs: tuple[Array, Array]) -> tuple[Array, Array]:
-        out = predict(model, main, inputs[0], inputs[1])
-        return out.logits, out.weights
-
-    logits, weights = jax.lax.map(chunk, (chunked(x), chunked(mask)))
-    return logits.reshape(-1, model.n_classes)[:n], weights.reshape(-1, model.n_sensors)[:n]
 
 
 def make_train(

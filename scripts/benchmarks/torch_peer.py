@@ -193,7 +193,7 @@ def train_epoch(
 
     Args:
         net, optimizer: to train; the optimizer is `torch.optim.AdamW`.
-        config: a `fusion.config.TrainConfig`; terms: a `fusion.losses.LossConfig`.
+        config: a `fusion.config.TrainConfig`; terms: a `fusion.loss_config.LossConfig`.
         rate: learning rate of a step.
     """
     step = 0

@@ -171,7 +171,7 @@ def options(variant: Variant, preset: str) -> Any:
 
 def execute(variant: Variant, dataset: Any, preset: str) -> dict[str, Any]:
     """Train one variant on the rows that are not held out and score it on those that are."""
-    from fusion.models import count_parameters
+    from fusion.sizes import count_parameters
     from snn_fusion_failure.commands.argate_runs import (
         build_cases,
         build_settings,

@@ -94,7 +94,7 @@ def main(config: Config) -> dict[str, Any]:
     """Train, score, draw; returns what `result.json` holds."""
     enable_compilation_cache()
     from fusion.data import load, validation_split
-    from fusion.models import count_parameters
+    from fusion.sizes import count_parameters
 
     if config.data is not None:
         from fusion.data.own_file import load_file

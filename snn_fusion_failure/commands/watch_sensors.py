@@ -198,7 +198,7 @@ def follow(
                 time.sleep(max(0.0, 1.0 / config.rate - took[-1]))
     assert answer is not None
     if config.picture is not None:
-        from fusion.plots import animate_stream
+        from snn_fusion_failure.records.plots import animate_stream
 
         config.picture.parent.mkdir(parents=True, exist_ok=True)
         moving = animate_stream(np.asarray(weights), np.asarray(risks), fitted.channels)

@@ -153,7 +153,7 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
 
     from fusion import evaluate
     from fusion.loop import test_output
-    from fusion.models import count_parameters
+    from fusion.sizes import count_parameters
     from snn_fusion_failure.commands.argate_runs import (
         Config,
         build_cases,

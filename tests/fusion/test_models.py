@@ -15,12 +15,11 @@ from fusion.encoders import EncoderConfig
 from fusion.losses import LossConfig
 from fusion.models import (
     auxiliary_logits,
-    count_parameters,
     export,
     init,
-    match_parameters,
     predict,
 )
+from fusion.sizes import count_parameters, match_parameters
 
 SMALL = ModelConfig(
     n_sensors=3,

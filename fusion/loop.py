@@ -23,8 +23,8 @@ from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
 from fusion.failure_kinds import Kinds, check_kinds
 from fusion.failures import Protocol, corrupt
-from fusion.inference import predict_batches
 from fusion.models import export
+from fusion.prediction import predict_batches
 from fusion.train import TrainState, init_state, make_epoch
 
 

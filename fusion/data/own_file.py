@@ -1,8 +1,10 @@
-"""One's own windows from an `.npz` file of a small, checked schema."""
+"""One's own windows from an `.npz` file of a small, checked schema, and recordings from CSV."""
 
 from __future__ import annotations
 
+import csv
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -61,3 +63,30 @@ def load_file(path: str | Path, *, seed: int = 0) -> Dataset:
         classes=names.get("classes"),
         seed=seed,
     )
+
+
+def read_recording(path: Path, channels: Sequence[str]) -> np.ndarray:
+    """A recording `[sample, sensor]` from CSV, its columns in the order of the channels.
+
+    Args:
+        path: header of channel names, one sample a line; an empty cell is a lost sample (NaN).
+        channels: of the network; other columns are left out.
+
+    Raises:
+        ValueError: missing columns, or a cell that is no number, with its line.
+    """
+    with path.open(encoding="utf-8", newline="") as file:
+        rows = csv.DictReader(file)
+        missing = [c for c in channels if c not in (rows.fieldnames or ())]
+        if missing:
+            raise ValueError(f"{path}, line 1: columns {missing} are missing from the header")
+        found = []
+        for number, row in enumerate(rows, start=2):
+            try:
+                found.append([float(row[c] or "nan") for c in channels])
+            except (TypeError, ValueError):
+                raise ValueError(
+                    f"{path}, line {number}: expected {len(channels)} numbers; leave the cell of a "
+                    "lost sample empty"
+                ) from None
+    return np.asarray(found).reshape(-1, len(channels))

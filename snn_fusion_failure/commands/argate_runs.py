@@ -29,19 +29,17 @@ class Config:
     dataset: str = "har"
     """har, driver or simulated."""
     data: Path | None = None
-    """Your own windows instead: .npz with x [N, K, T] and y [N], optional groups, channels and
-    classes."""
+    """Your own windows instead: .npz with x, y and optional groups, channels, classes."""
     model: str = "argate_l"
-    """baseline, netgated, argate_ws, argate_plus, argate_l; argate_plus_printed, argate_l_printed
-    (the equations to the letter); or equal_weights, modality_dropout, embracenet, oracle."""
+    """baseline, netgated, argate_ws, argate_plus, argate_l; *_printed (to the letter); or
+    equal_weights, modality_dropout, embracenet, oracle."""
     head: str | None = None
-    """dense; for driver also neighbourhood (its default: compares with training rows) and
-    embedding (the same encoders without them)."""
+    """dense; for driver also neighbourhood (its default) and embedding."""
     preset: str = "paper"
     """paper (the settings of record) or quick (few epochs)."""
     protocol: ProtocolName | None = None
-    """Which sensors fail: none; drawn per example; the published fixed set; other counts in test
-    than in training. Left out: two networks, one for clean and one for random."""
+    """Which sensors fail: none; drawn anew; the published set; other counts in test. Left out: two
+    networks, for clean and for random."""
     n_clean: int | None = None
     """Clean sensors of a corrupted example (random, fixed); about half when left out."""
     train_range: tuple[int, int] | None = None
@@ -49,14 +47,13 @@ class Config:
     test_range: tuple[int, int] | None = None
     """Fewest and most failing sensors in test (generalisation); 3 8 when left out."""
     kind: str = "uniform"
-    """Failure kind: uniform, gaussian, zero, stuck, drift, dropout, gain, clip; or several with
-    commas, of which each example draws one."""
+    """uniform, gaussian, zero, stuck, drift, dropout, gain, clip; or several with commas."""
     redraw: bool = True
     """Draw the training noise anew in every epoch; --no-redraw draws it once (literal)."""
     split: str | None = None
     """How test rows are taken, e.g. trip for driver; the data set's default when left out."""
     features: str | None = None
-    """Signals of driver: complete (its default), tagged (with one that names trips) or source."""
+    """Signals of driver: complete, tagged (one names trips) or source."""
     validation: bool = False
     """Score on a held-out part of the training rows instead of the test rows."""
     epochs: int | None = None
@@ -72,13 +69,12 @@ class Config:
     mask_supervision: bool = False
     """The gate also learns from the mask of the simulated failures."""
     changes: Annotated[tuple[str, ...], tyro.conf.arg(name="set")] = ()
-    """Changed constants as part.name=value, parts model, train and hyper:
-    `model.loss.uniform_floor=0 hyper.weight_decay=1e-4`."""
+    """Changed constants, `model.loss.uniform_floor=0 train.jitter=0.1 hyper.weight_decay=1e-4`."""
     seed: int = 0
     data_dir: Path | None = None
     """Folder of the data sets; $FUSION_DATA_DIR and the user cache are searched next."""
     download: bool = False
-    """Fetch the data set from its publisher when it is nowhere."""
+    """Fetch the data set when it is nowhere."""
     out: Path | None = None
     """Run folder; runs/<dataset>_<model>_<protocol>_s<seed> when left out."""
     resume: bool = False
@@ -91,8 +87,7 @@ class Case(NamedTuple):
     """One training and its test.
 
     Attributes:
-        title: which sensors fail, in words.
-        noise: the same as a corruption.
+        title: which sensors fail, in words; noise: the same as a corruption.
     """
 
     title: str
@@ -112,10 +107,9 @@ def build_settings(config: Config, dataset: Dataset) -> Preset:
         "hyper.loss.tau": config.tau,
         "model.normalizer": config.normalizer,
         "model.loss.fixed_targets": config.normalizer,
+        "model.loss.mask_supervision": "true" if config.mask_supervision else None,
     }
     given = [f"{name}={value}" for name, value in named.items() if value is not None]
-    if config.mask_supervision:
-        given.append("model.loss.mask_supervision=true")
     return Preset(**apply_changes(parts, [*given, *config.changes]))
 
 
@@ -168,8 +162,7 @@ def build_cases(config: Config, dataset: Dataset) -> dict[str, Case]:
     made: dict[str, Case] = {}
     for name in names:
         train, test, title = _protocols(config, dataset, name)
-        kinds = tuple(config.kind.split(","))
-        kind = kinds if len(kinds) > 1 else config.kind
+        kind = tuple(config.kind.split(",")) if "," in config.kind else config.kind
         noise = Corruption(train, test, kind, redraw=config.redraw)
         made[name] = Case(title, noise)
     return made

@@ -56,32 +56,6 @@ class Config:
     seed: int = 0
 
 
-def read_csv(path: Path, channels: Sequence[str]) -> np.ndarray:
-    """A recording `[sample, sensor]`, its columns in the order of the channels.
-
-    Raises:
-        ValueError: missing columns, or a cell that is no number, with its line.
-    """
-    import csv
-
-    import numpy as np
-
-    with path.open(encoding="utf-8", newline="") as file:
-        rows = csv.DictReader(file)
-        missing = [c for c in channels if c not in (rows.fieldnames or ())]
-        if missing:
-            raise ValueError(f"{path}, line 1: columns {missing} are missing from the header")
-        found = []
-        for number, row in enumerate(rows, start=2):
-            try:
-                found.append([float(row[c] or "nan") for c in channels])
-            except (TypeError, ValueError):
-                raise ValueError(
-                    f"{path}, line {number}: expected {len(channels)} numbers"
-                ) from None
-    return np.asarray(found).reshape(-1, len(channels))
-
-
 def train(config: Config) -> tuple[FittedARGate, np.ndarray]:
     """A network and a recording of test windows, `[sample, sensor]` in raw units."""
     import jax
@@ -153,7 +127,9 @@ def main(config: Config) -> dict[str, Any]:
     else:
         fitted, stream = FittedARGate.load(config.model), np.zeros((0, 0))
     if config.recording is not None:
-        stream = read_csv(config.recording, fitted.channels)
+        from fusion.data.own_file import read_recording
+
+        stream = read_recording(config.recording, fitted.channels)
     else:
         sensor = len(fitted.channels) - 1 if config.fail is None else config.fail
         if not 0 <= sensor < len(fitted.channels):

@@ -1,7 +1,6 @@
 """Tables 3.1 to 3.6: which trainings fill their cells, and how runs become a table of record.
 
-A run is one (table, row, model, seed). Its scores go to a file of their own as soon as they exist,
-so an interrupted reproduction loses the run in flight and repeats none.
+A run is one (table, row, model, seed) with a file of its own; an interruption loses one run.
 """
 
 from __future__ import annotations
@@ -32,8 +31,8 @@ class Row:
     Attributes:
         name: as the source's table spells it.
         settings: fields of `train_argate.Config` that differ from its defaults.
-        references: train the reference models on this row too. `equal_weights` is the baseline of
-            the driver's neighbourhood head; `baseline` there has dense layers as in the source.
+        references: these columns, too. `equal_weights` is the baseline of the driver's
+            neighbourhood head; `baseline` there has dense layers as in the source.
         robustness: also score under the failure kinds that are never trained on.
         channel: keep this channel's fusion weights (Figure 3.7).
     """
@@ -47,13 +46,9 @@ class Row:
 
 def _random(dataset: str, n_clean: int, kind: str, **options: Any) -> Row:
     settings = {"dataset": dataset, "protocol": "random", "n_clean": n_clean, "kind": kind}
-    references = options.pop("references", ())
-    if dataset == "har":
-        references = (*PRINTED, *references)
-    elif kind == "gaussian":  # the ceilings do not depend on how sensors fail
-        references = tuple(m for m in DRIVER_REFERENCES if m not in CEILINGS)
-    else:
-        references = DRIVER_REFERENCES
+    references = (*PRINTED, *options.pop("references", ()))
+    if dataset == "driver":  # the ceilings do not depend on how sensors fail
+        references = DRIVER_REFERENCES[: None if kind == "uniform" else -len(CEILINGS)]
     return Row(f"n_clean={n_clean} {kind}", settings, references, **options)
 
 
@@ -165,14 +160,8 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
     if run.model in CEILINGS:
         (case,) = build_cases(Config(**run.row.settings), dataset).values()
         return score(run.model, dataset, case.noise, run.seed)
-    dense = run.model == "baseline" and dataset.name == "driver"
-    config = Config(
-        model=run.model,
-        preset=preset,
-        seed=run.seed,
-        head="dense" if dense else None,
-        **run.row.settings,
-    )
+    head = "dense" if run.model == "baseline" else None
+    config = Config(model=run.model, preset=preset, seed=run.seed, head=head, **run.row.settings)
     settings = build_settings(config, dataset)
     (case,) = build_cases(config, dataset).values()
     fitted, output = train_and_test(settings, dataset, case.noise, run.seed)
@@ -206,6 +195,14 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
     return record
 
 
+PAIRS = (
+    ("argate_plus", "baseline"),
+    ("argate_l", "argate_plus"),
+    ("argate_l", "baseline"),
+    *((m, "equal_weights") for m in ("netgated", "argate_plus", "argate_l")),
+    *((m, f"{m}_printed") for m in ("argate_plus", "argate_l")),
+)
+"""Columns that are compared seed by seed."""
 METRICS = (
     "accuracy",
     "accuracy_clean",
@@ -216,7 +213,7 @@ METRICS = (
 
 
 def load_runs(table: str, out: Path, seeds: int) -> dict[tuple[str, str], dict[int, Any]]:
-    """Scores on disk: (row, model) -> seed -> record."""
+    """(row, model) -> seed -> record."""
     held: dict[tuple[str, str], dict[int, Any]] = {}
     for run in runs(table, seeds):
         path = run.path(out)
@@ -263,10 +260,7 @@ def collect(
                 cell["source"] = printed["rows"][row][printed["columns"].index(model)]
             rows.append(cell)
     for row in dict.fromkeys(name for name, _ in held):
-        pairs = [("argate_plus", "baseline"), ("argate_l", "argate_plus"), ("argate_l", "baseline")]
-        pairs += [(m, "equal_weights") for m in ("netgated", "argate_plus", "argate_l")]
-        pairs += [("argate_plus", "argate_plus_printed"), ("argate_l", "argate_l_printed")]
-        for better, worse in pairs:
+        for better, worse in PAIRS:
             a, b = held.get((row, better), {}), held.get((row, worse), {})
             common = sorted(set(a) & set(b))
             if len(common) < 2:
@@ -276,13 +270,10 @@ def collect(
             )
             found = {"row": row, "comparison": f"{better} - {worse}", **test._asdict()}
             if all("subjects" in t[s] for t in (a, b) for s in common):
-                differences = [
-                    np.subtract(a[s]["subjects"], b[s]["subjects"]).tolist() for s in common
-                ]
-                found["over_subjects_and_seeds"] = list(two_way_interval(differences))
+                apart = [np.subtract(a[s]["subjects"], b[s]["subjects"]).tolist() for s in common]
+                found["over_subjects_and_seeds"] = list(two_way_interval(apart))
             studies.append(found)
         oracle = held.get((row, "oracle"), {})
-        # The gap is that to the baseline with the same head.
         base = held.get((row, "equal_weights")) or held.get((row, "baseline"), {})
         for model in FIVE[1:]:
             three = [held.get((row, model), {}), base, oracle]

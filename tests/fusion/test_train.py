@@ -16,10 +16,10 @@ from fusion.data.dataset import Scale
 from fusion.encoders import EncoderConfig
 from fusion.evaluate import gate_auroc, split_accuracy
 from fusion.failures import no_failure, random_failing
-from fusion.inference import predict_batches
 from fusion.loop import Corruption, TrainingDiverged, fit, test_output
 from fusion.losses import LossConfig, LossParams
 from fusion.models import export
+from fusion.prediction import predict_batches
 from fusion.presets import preset
 from fusion.targets import check_targets
 from fusion.train import make_epoch, make_train

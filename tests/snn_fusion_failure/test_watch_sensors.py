@@ -8,6 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from fusion.data.own_file import read_recording
 from fusion.fitted import FittedARGate
 from snn_fusion_failure.commands import train_argate, watch_sensors
 from snn_fusion_failure.commands.argate_runs import Config as TrainConfig
@@ -41,7 +42,7 @@ def test_a_recording_from_a_file_is_watched_with_its_lost_samples(
     lines[20] = ",".join(["", *cells[1:]])  # the last sensor's
     path = tmp_path / "stream.csv"
     path.write_text("\n".join(lines))
-    read = watch_sensors.read_csv(path, names)
+    read = read_recording(path, names)
     assert np.isnan(read[19, -1]) and read[0, 0] == pytest.approx(rows[0, 0], abs=1e-3)
     config = watch_sensors.Config(model=folder / "net.npz", recording=path)
     assert names[-1] in watch_sensors.main(config)["failed"]
@@ -52,9 +53,9 @@ def test_bad_streams_are_refused_with_their_line(shown: tuple[Path, dict], tmp_p
     path = tmp_path / "stream.csv"
     path.write_text("a,b\n1,2\n3,x\n")
     with pytest.raises(ValueError, match="line 3"):
-        watch_sensors.read_csv(path, ("a", "b"))
+        read_recording(path, ("a", "b"))
     with pytest.raises(ValueError, match="line 1"):
-        watch_sensors.read_csv(path, ("a", "c"))
+        read_recording(path, ("a", "c"))
     path.write_text(",".join(FittedARGate.load(folder / "net.npz").channels) + "\n")
     config = watch_sensors.Config(model=folder / "net.npz", recording=path)
     with pytest.raises(ValueError, match="recording of 0 samples"):

@@ -15,8 +15,8 @@ import jax.numpy as jnp
 
 from fusion import failures
 from fusion.data import load, validation_split
-from fusion.inference import predict_batches
 from fusion.models import export
+from fusion.prediction import predict_batches
 from fusion.presets import preset as named_preset
 from fusion.train import init_state, make_epoch, make_train
 from snn_fusion_failure.sweeps.study import Carry, Metric, Study

@@ -49,7 +49,7 @@ class Config:
     kind: str = "uniform"
     """uniform, gaussian, zero, stuck, drift, dropout, gain, clip; or several with commas."""
     redraw: bool = True
-    """Draw the training noise anew in every epoch; --no-redraw draws it once (literal)."""
+    """New noise in every epoch; --no-redraw draws it once (literal)."""
     split: str | None = None
     """How test rows are taken, e.g. trip for driver; the data set's default when left out."""
     features: str | None = None
@@ -67,7 +67,7 @@ class Config:
     normalizer: Literal["softmax", "softmax_sigmoid"] | None = None
     """Of the fusion weights and of the fixed targets; softmax_sigmoid is the printed one."""
     mask_supervision: bool = False
-    """The gate also learns from the mask of the simulated failures."""
+    """The gate also learns from the masks of simulated failures."""
     changes: Annotated[tuple[str, ...], tyro.conf.arg(name="set")] = ()
     """Changed constants, `model.loss.uniform_floor=0 train.jitter=0.1 hyper.weight_decay=1e-4`."""
     seed: int = 0
@@ -78,7 +78,6 @@ class Config:
     out: Path | None = None
     """Run folder; runs/<dataset>_<model>_<protocol>_s<seed> when left out."""
     resume: bool = False
-    """Go on with the run in the folder."""
     overwrite: bool = False
     """Replace the run in the folder."""
 

@@ -225,7 +225,7 @@ def test_a_signal_missing_for_a_trip_is_refused(
 def test_bad_options(tmp_path: Path) -> None:
     with pytest.raises(ValueError, match=r"split='rows': expected one of 'random', 'trip'"):
         load_driver(tmp_path, split="rows")  # type: ignore[arg-type]
-    with pytest.raises(ValueError, match=r"expected one of 'complete', 'source'"):
+    with pytest.raises(ValueError, match=r"expected one of 'complete', 'tagged', 'source'"):
         load_driver(tmp_path, features="all")  # type: ignore[arg-type]
     with pytest.raises(FileNotFoundError, match=r"no download: ask the publisher"):
         load_driver(tmp_path)
@@ -240,3 +240,16 @@ def test_real_set(data_dir: Path) -> None:
     assert np.unique(data.train_group).size == module.N_TRIPS
     fails = {n: published_fixed(data, n).failing for n in (5, 7)}
     assert len(fails[5]) == 10 and len(fails[7]) == 8 and set(fails[7]) < set(fails[5])
+
+
+def test_no_stand_in_of_the_default_set_holds_for_whole_trips() -> None:
+    """The earlier set has one, which is the only difference between them."""
+    assert "Engine_soacking_time" not in DRIVER_CHANNELS
+    differ = {
+        pair
+        for pair in zip(DRIVER_CHANNELS, DRIVER_TAGGED_CHANNELS, strict=True)
+        if len(set(pair)) > 1
+    }
+    assert differ == {("Steering_wheel_speed", "Engine_soacking_time")}
+    with pytest.raises(ValueError, match="features='complete'"):
+        load("har", features="complete")

@@ -125,6 +125,7 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         by_group = group_rates(table, reading.sonar, reading.distance, reading.angle)
         rates = jnp.repeat(by_group, config.group_exc + config.group_inh)
         state = network.reset_membranes(constants, state, fresh)
+        baselines = state.baseline_input, state.baseline_hidden
 
         def draw(index: Array | int) -> Array:
             window_key = jax.random.fold_in(key, index)
@@ -162,6 +163,10 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
             (state, total), _ = jax.lax.scan(body, (state, total), jnp.arange(n_windows - 1))
             keep = jnp.ones_like(keep)
         state, eligibility, spikes = run(state, n_windows - 1, keep)
+        # A robot that waits for the others of its block learns nothing, running means included.
+        mine = state.baseline_input, state.baseline_hidden
+        mine = jax.tree.map(lambda new, old: jnp.where(active, new, old), mine, baselines)
+        state = state._replace(baseline_input=mine[0], baseline_hidden=mine[1])
         firing = (total + count(spikes)) / (config.control_steps * config.dt)
         steering = steering_angle(constants, firing[:2])
         return state, steering, SNNMemory(eligibility, reading), firing

@@ -60,6 +60,7 @@ def _advance(
     n_trials: int,
     max_steps: int,
     circles: Array | None,
+    first: int,
     params: Any,
     map: world.WorldParams,
     key: Key[Array, ""],
@@ -70,7 +71,7 @@ def _advance(
     active = carry.trial < n_trials
     robot, result = carry.robot, carry.result
     step = result.steps[trial]
-    step_key = jax.random.fold_in(jax.random.fold_in(key, 2 * trial + 1), step)
+    step_key = jax.random.fold_in(jax.random.fold_in(key, 2 * _number(trial, first) + 1), step)
     reading = world.observe(map, robot)
     state, steering, memory, info = agent.act(
         params, carry.agent, reading, step == 0, active, key=step_key
@@ -96,7 +97,7 @@ def _advance(
     following_trial = jnp.where(broken, n_trials, trial + over.astype(jnp.int32))
     following_trial = jnp.where(active, following_trial, carry.trial)
     begins = over & active & (following_trial < n_trials)
-    begin = _start(key, following_trial, map, circles, n_trials)
+    begin = _start(key, following_trial, map, circles, n_trials, first)
     robot = jax.tree.map(lambda a, b: jnp.where(begins, a, b), begin, moved)
     if poses is not None:
         first = jnp.where(begins, following_trial, n_trials)
@@ -115,11 +116,21 @@ def _pose(robot: world.WorldState) -> Array:
     return jnp.stack([robot.x, robot.y, robot.heading])
 
 
+def _number(trial: Array, first: int) -> Array:
+    """Number of a trial in its robot's life, when `first` is that of the phase's first one."""
+    return trial + first if first else trial
+
+
 def _start(
-    key: Array, trial: Array, map: world.WorldParams, circles: Array | None, n_trials: int
+    key: Array,
+    trial: Array,
+    map: world.WorldParams,
+    circles: Array | None,
+    n_trials: int,
+    first: int = 0,
 ) -> world.WorldState:
     circle = None if circles is None else circles[jnp.minimum(trial, n_trials - 1)]
-    return world.reset(map, key=jax.random.fold_in(key, 2 * trial), circle=circle)
+    return world.reset(map, key=jax.random.fold_in(key, 2 * _number(trial, first)), circle=circle)
 
 
 def start_states(
@@ -171,6 +182,7 @@ def run_phase(
     n_trials: int,
     max_steps: int,
     circles: Int[Array, " trials"] | None = None,
+    first: int = 0,
     params_axis: Any = None,
     map_axis: Any = None,
     record: bool = False,
@@ -189,6 +201,8 @@ def run_phase(
         n_trials: trials per robot.
         max_steps: control steps after which a trial is given up.
         circles: start circle of each trial; drawn at random when not given.
+        first: number of the first trial: a phase in two parts, the second one from the states and
+            the number at which the first one ended, is the phase in one.
         params_axis, map_axis: 0 when each robot has its own, a tree for some leaves only, as in
             `jax.vmap`.
         record: keep the poses.
@@ -203,12 +217,13 @@ def run_phase(
     require_keys(keys)
     require_whole("n_trials", n_trials, 1, "ask for at least one trial")
     require_whole("max_steps", max_steps, 1, "allow at least one control step")
+    require_whole("first", first, 0, "count trials from 0")
     check_circles(map, circles, n_trials)
     robots = keys.shape[0]
     n_info = len(agent.info)
 
     def begin(key: Array, map: world.WorldParams) -> tuple[world.WorldState, TrialResult]:
-        robot = _start(key, jnp.zeros((), jnp.int32), map, circles, n_trials)
+        robot = _start(key, jnp.zeros((), jnp.int32), map, circles, n_trials, first)
         poses = None
         if record:
             poses = jnp.full((n_trials, max_steps + 1, 3), jnp.nan, robot.x.dtype)
@@ -222,7 +237,7 @@ def run_phase(
         )
 
     def advance(params: Any, map: world.WorldParams, key: Array, carry: _Carry) -> _Carry:
-        return _advance(agent, n_trials, max_steps, circles, params, map, key, carry)
+        return _advance(agent, n_trials, max_steps, circles, first, params, map, key, carry)
 
     many = jax.vmap(advance, in_axes=(params_axis, map_axis, 0, 0))
     robot, result = jax.vmap(begin, in_axes=(0, map_axis))(keys, map)

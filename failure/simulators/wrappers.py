@@ -12,6 +12,7 @@ import hashlib
 import json
 import multiprocessing
 import os
+import pickle
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -70,13 +71,14 @@ class _Process:
         # Not fork: the parent has threads of its own (XLA's among them).
         context = multiprocessing.get_context("spawn")
         self._pipe, theirs = context.Pipe()
-        self._process = context.Process(target=_serve, args=(self._function, theirs), daemon=True)
-        self._process.start()
-        theirs.close()
-        # The time limit is the simulation's; starting a process and importing has one of its own.
+        process = context.Process(target=_serve, args=(self._function, theirs), daemon=True)
         try:
+            process.start()
+            self._process = process
+            theirs.close()
+            # The time limit is the simulation's; starting and importing has one of its own.
             ready = self._pipe.poll(_START_LIMIT) and self._pipe.recv() == "ready"
-        except EOFError:
+        except (EOFError, AttributeError, TypeError, pickle.PicklingError):
             ready = False
         if not ready:
             self._stop()
@@ -84,7 +86,7 @@ class _Process:
                 f"function={self._function!r}: expected a top-level function of a module that a "
                 "new process can import"
             )
-        self._group.adopt(self._process.pid)
+        self._group.adopt(process.pid)
 
     def _stop(self) -> None:
         if self._process is not None:

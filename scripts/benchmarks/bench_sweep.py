@@ -1,12 +1,12 @@
-"""What a chunk costs, what two workers gain, and how many workers one folder can take.
+"""What the engine adds to a trial, what workers gain, and how many of them one folder can take.
 
     python scripts/benchmarks/bench_sweep.py
 
-Measures, on the file system of `--folder`: writing, reading and listing chunk files; several
-processes that write into one folder as fast as they can; a sweep with one and with two worker
-processes. Then simulates up to 1,000 workers that compute a chunk, wait for their turn at the
-folder and go on, with the measured time per file. Writes `results/bench_sweep.json`. About 90
-seconds on two free cores.
+Measures: the engine's time per trial beside the trial's own; on the file system of `--folder`,
+writing, reading and listing chunk files, leases, and several processes that write into one folder
+as fast as they can; a sweep with 1, 2 and 4 worker processes. Then simulates up to 10,000 workers
+that queue for such a folder and for one that is ten times as slow. Writes
+`results/bench_sweep.json`. About three CPU-minutes.
 """
 
 from __future__ import annotations
@@ -16,6 +16,7 @@ import os
 import resource
 import tempfile
 import time
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -28,6 +29,9 @@ from snn_fusion_failure.runs import (
 )
 from snn_fusion_failure.sweeps.capacity import chunk_costs, writer_rates
 from snn_fusion_failure.sweeps.queueing import simulate
+
+SLOW = 10.0
+"""A slow file system takes so many times as long for everything."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -42,10 +46,84 @@ class Config:
     """Processes that write at the same time."""
     steps: int = 60_000
     """Steps per trial of the study that the workers run."""
-    workers: tuple[int, ...] = (1, 2)
+    workers: tuple[int, ...] = (1, 2, 4)
     """Worker processes of the measured sweep; empty skips it."""
+    chunks: int = 8
+    """Chunks from which the engine's time per trial is taken."""
+    snn: bool = True
+    """Measure a trial of `snn`, to which the engine's time is compared."""
+    simulated: tuple[int, ...] = (1, 10, 100, 1_000, 10_000)
+    """Workers of the simulation."""
     out: Path = repository.RESULTS / "bench_sweep.json"
     """Where the numbers go."""
+
+
+def trial_seconds(study: Any, columns: dict[str, Any], n: int, repeats: int) -> float:
+    """Seconds per trial of the study's compiled function alone, `n` side by side; the quickest."""
+    import jax
+    import numpy as np
+
+    from snn_fusion_failure.sweeps.leaves import batch
+
+    units = {leaf: study.unit_of(leaf) for leaf in study.leaves}
+    params = batch(study.params, {k: np.resize(v, n) for k, v in columns.items()}, n, units,
+                   study.dtype)  # fmt: skip
+    keys = jax.random.split(jax.random.key(0), n)
+    run = jax.jit(study.run)
+    jax.block_until_ready(run(params, keys))
+    seconds = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        jax.block_until_ready(run(params, keys))
+        seconds.append(time.perf_counter() - start)
+    return min(seconds) / n
+
+
+def _stamp(times: list[float], name: str) -> None:
+    times.append(time.perf_counter())
+
+
+def overhead(folder: Path, chunks: int) -> dict[str, Any]:
+    """Milliseconds per trial that pass in the engine and not in the trial's own function.
+
+    A sweep in this process, from the beginning of its second chunk (compiled by then) to its end,
+    keys, files and leases included, less the time of the compiled function for as many trials.
+    """
+    import numpy as np
+
+    from snn_fusion_failure.commands import sweep
+    from snn_fusion_failure.sweeps.chunks import run_shard
+    from snn_fusion_failure.sweeps.study import load_study
+
+    study = load_study("lif", ["steps=10"])
+    found = {}
+    for n in (16, 1024):
+        count = n * chunks // 16
+        config = sweep.Config(
+            study="lif", options=("steps=10",), grid=(f"drive=16:40:{count}",), seeds=16,
+            chunk_size=str(n), chunk_trials=n, quiet=True, out=folder / f"overhead{n}",
+        )  # fmt: skip
+        starts: list[float] = []
+        made = sweep.open_sweep(config)
+        outcome = run_shard(made, on_start=partial(_stamp, starts))
+        end = time.perf_counter()
+        assert outcome.complete and len(starts) == chunks
+        own = trial_seconds(study, {"drive": np.linspace(16.0, 40.0, count)}, n, 5)
+        whole = (end - starts[1]) / (n * (chunks - 1))
+        found[f"{n} trials a chunk"] = {
+            "overhead_ms_per_trial": 1e3 * (whole - own), "trial_ms": 1e3 * own,
+        }  # fmt: skip
+    return found
+
+
+def share_of_snn(per_trial_ms: float) -> dict[str, float]:
+    """The engine's time as a share of that of a trial of `snn` at its defaults."""
+    import numpy as np
+
+    from snn_fusion_failure.sweeps.study import load_study
+
+    seconds = trial_seconds(load_study("snn"), {"gamma": np.asarray([1e-4])}, 4, 1)
+    return {"snn_trial_s": seconds, "overhead_percent": 0.1 * per_trial_ms / seconds}
 
 
 def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str, Any]:
@@ -85,33 +163,53 @@ def sweep_times(folder: Path, workers: tuple[int, ...], steps: int) -> dict[str,
     return found
 
 
+def crowds(costs: dict[str, Any], file_s: float, workers: tuple[int, ...]) -> list[dict[str, Any]]:
+    """The simulation, for chunks of several lengths, all ways of handing out, both folders."""
+    claim_s, entry_s = 1e-3 * costs["lease_ms"], 1e-7 * costs["list_10000_files_ms"]
+    rows = []
+    for slower in (1.0, SLOW):
+        for chunk_s in (1.0, 10.0, 60.0):
+            for count in workers:
+                for way in ("dealt", "queue", "leases"):
+                    numbers = simulate(
+                        count, chunk_s, slower * file_s, way=way, claim_s=slower * claim_s,
+                        entry_s=slower * entry_s,
+                    )  # fmt: skip
+                    rows.append({"workers": count, "chunk_s": chunk_s, "way": way,
+                                 "slower": slower, **numbers})  # fmt: skip
+    return rows
+
+
 def main(config: Config) -> dict[str, Any]:
     """Measure, simulate, write."""
     enable_compilation_cache()
     with tempfile.TemporaryDirectory(dir=config.folder) as name:
         folder = Path(name)
+        engine: dict[str, Any] = overhead(folder, config.chunks)
+        if config.snn:
+            # 16 trials a chunk is what a sweep of `snn` has by itself.
+            engine |= share_of_snn(engine["16 trials a chunk"]["overhead_ms_per_trial"])
         costs = chunk_costs(folder, config.repeats)
         rates = writer_rates(folder, config.writers, config.repeats)
         times = sweep_times(folder, config.workers, config.steps)
     # The rate under the largest crowd: a lone writer waits for its own disk and core, not for the
     # folder, so its rate says nothing about what the folder can take.
     file_s = 1.0 / rates[str(max(config.writers))]
-    simulated = []
-    for chunk_s in (1.0, 10.0, 60.0):
-        for workers in (1, 10, 100, 300, 1000):
-            for pull in (False, True):
-                numbers = simulate(workers, chunk_s, file_s, pull=pull)
-                simulated.append({"workers": workers, "chunk_s": chunk_s, "pull": pull, **numbers})
-    limits = {f"{c:g} s": c / file_s + 1.0 for c in (1.0, 10.0, 60.0)}
+    busy_s = {"dealt": file_s, "leases": file_s + 1e-3 * costs["lease_ms"]}
     result = {
         "bench": "sweep",
+        "engine": engine,
         "chunk": costs,
         "files_per_second_by_writers": rates,
         "sweep_by_workers": times,
+        "cores": os.cpu_count(),
         "load_average": os.getloadavg()[0],
         "file_s": file_s,
-        "workers_that_saturate_the_folder": limits,
-        "simulated": simulated,
+        "workers_that_saturate_the_folder": {
+            way: {f"{c:g} s": c / busy + 1.0 for c in (1.0, 10.0, 60.0)}
+            for way, busy in busy_s.items()
+        },
+        "simulated": crowds(costs, file_s, config.simulated),
         **provenance(),
     }
     write_json(config.out, result)
@@ -121,16 +219,19 @@ def main(config: Config) -> dict[str, Any]:
 def fields(result: dict[str, Any]) -> dict[str, float]:
     """What the result line says, below a line for each simulated crowd."""
     for row in result["simulated"]:
-        way = "pulled" if row["pull"] else "shards"
         print(
-            f"{row['workers']:>5} workers, chunks of {row['chunk_s']:>4g} s, {way}: efficiency "
-            f"{row['efficiency']:.3f}, wait {1e3 * row['wait_s']:.1f} ms"
+            f"{row['workers']:>6} workers, chunks of {row['chunk_s']:>4g} s, {row['way']:<6}, "
+            f"folder {row['slower']:>4g} times as slow: efficiency {row['efficiency']:.3f}, "
+            f"wait {1e3 * row['wait_s']:.1f} ms"
         )
-    times = result["sweep_by_workers"]
+    engine, times = result["engine"], result["sweep_by_workers"]
+    share = {"overhead_percent_of_snn": engine.get("overhead_percent")}
     return {
+        "overhead_ms_per_trial": engine["1024 trials a chunk"]["overhead_ms_per_trial"],
+        **{name: value for name, value in share.items() if value is not None},
         "write_ms": result["chunk"]["16 trials"]["write_ms"],
         "files_per_second": 1.0 / result["file_s"],
-        "saturate_10s": result["workers_that_saturate_the_folder"]["10 s"],
+        "saturate_10s": result["workers_that_saturate_the_folder"]["leases"]["10 s"],
         **{f"wall_{k}": v["wall_s"] for k, v in times.items()},
     }
 

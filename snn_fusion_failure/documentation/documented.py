@@ -199,7 +199,10 @@ RULES = (
     Rule("sweep.py argate", "--seeds 1 --options epochs=1 model=baseline"),
     Rule("sweep.py snn", "--seeds 1 --options max_steps=2 n_learn=1 n_test=2 --chunk-size 1"),
     Rule("sweep.py", "--study lif --grid drive=16,40 --seeds 1 --out runs/sweep_bare"),
-    Rule("bench_sweep.py", "--repeats 2 --writers 1 --workers 1 --steps 100"),
+    Rule(
+        "bench_sweep.py",
+        "--repeats 2 --writers 1 --workers 1 --steps 100 --chunks 2 --no-snn --simulated 10",
+    ),
     Rule("python -c"),
 )
 

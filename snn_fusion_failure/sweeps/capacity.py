@@ -20,6 +20,7 @@ from typing import Any
 
 import numpy as np
 
+from snn_fusion_failure.sweeps import leases
 from snn_fusion_failure.sweeps.chunkfile import load_chunk, save_chunk
 
 
@@ -41,7 +42,7 @@ def write_chunks(folder: str, first: int, count: int, n_trials: int) -> list[flo
 
 
 def chunk_costs(folder: Path, repeats: int) -> dict[str, Any]:
-    """Milliseconds per chunk file: written, read, listed; and its size."""
+    """Milliseconds per chunk: file written, read, listed, lease taken and given back; bytes."""
     costs: dict[str, Any] = {}
     names = [f"metric{i}" for i in range(4)]
     for n_trials in (16, 1024):
@@ -62,13 +63,24 @@ def chunk_costs(folder: Path, repeats: int) -> dict[str, Any]:
     crowd.mkdir()
     for number in range(10_000):
         (crowd / f"{number:06d}.npz").touch()
-    times = []
-    for _ in range(9):
-        start = time.perf_counter()
-        sum(name.endswith(".npz") for name in os.listdir(crowd))
-        times.append(time.perf_counter() - start)
-    costs["list_10000_files_ms"] = 1e3 * statistics.median(times)
+    costs["list_10000_files_ms"] = _median_ms(lambda: os.listdir(crowd), 9)
+    costs["lease_ms"] = _median_ms(lambda: _claim_and_release(folder), repeats)
     return costs
+
+
+def _median_ms(call: Callable[[], Any], repeats: int) -> float:
+    times = []
+    for _ in range(repeats):
+        start = time.perf_counter()
+        call()
+        times.append(time.perf_counter() - start)
+    return 1e3 * statistics.median(times)
+
+
+def _claim_and_release(folder: Path) -> None:
+    lease = leases.take(folder, "00000-000000", 60.0)
+    assert lease is not None
+    lease.release()
 
 
 def in_processes(

@@ -101,12 +101,11 @@ def build(
         raise ValueError(f"{trials} trials: expected at most 2**31 - 1; sweep in parts")
     _check_names(study, [axis.leaf for axis in made.axes])
     budgets = tuple(choices.pop("budgets", ()))
-    cut = study.with_budget(budgets[0]) if budgets and study.with_budget is not None else study
     sweep = Sweep(
         out, study, made, seeds, budgets=budgets, metrics=study.metrics,
-        objective=study.objective, rung_objective=cut.objective, budget_text=study.budget_text,
-        study_name=study.name, options=study.options, where=folder_of(study.source),
-        **choices,
+        objective=study.objective, rung_objective=_rung_objective(study, budgets),
+        budget_text=study.budget_text, study_name=study.name, options=study.options,
+        where=folder_of(study.source), **choices,
     )  # fmt: skip
     if not 0.0 <= sweep.min_valid <= 1.0:
         raise ValueError(f"min_valid={sweep.min_valid}: expected a share between 0 and 1")
@@ -117,6 +116,15 @@ def build(
         adaptive.check_adaptive(sweep)
     _check_settings(sweep)
     return sweep
+
+
+def _rung_objective(study: Study, budgets: Sequence[int]) -> str:
+    """What settings are ranked by before they have all of their training."""
+    if budgets and study.carry is not None:
+        return study.carry.objective or study.objective
+    if budgets and study.with_budget is not None:
+        return study.with_budget(budgets[0]).objective
+    return study.objective
 
 
 def _check_names(study: Study, leaves: Sequence[str]) -> None:

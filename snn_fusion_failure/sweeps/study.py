@@ -51,11 +51,14 @@ class Carry:
         advance: `(params, keys, carry, begin, end) -> (carry, metrics)`: the units `begin` to
             `end - 1`, static numbers. In one go or in parts the result is the same, to the bit.
         total: the budget of a whole trial.
+        objective: what settings are ranked by before the end, and the only metric that has to be a
+            number there; the study's own when left out.
     """
 
     init: Callable[[Any, Any], Any]
     advance: Callable[[Any, Any, Any, int, int], tuple[Any, dict[str, Any]]]
     total: int
+    objective: str = ""
 
 
 @dataclasses.dataclass(frozen=True)

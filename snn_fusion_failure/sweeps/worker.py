@@ -118,6 +118,13 @@ class Worker:
             study = study.with_budget(segment.budget)
         return study
 
+    def _needed(self, segment: Segment) -> list[str]:
+        """Metrics that have to be numbers for a trial to be valid."""
+        study = self.study(segment)
+        if segment.budget is not None and study.carry is not None and study.carry.objective:
+            return [study.carry.objective]
+        return [name for name, about in study.metrics.items() if not about.optional]
+
     def _program(self, segment: Segment) -> Program:
         name = f"{self.kind(segment)} {self.width}"
         if name not in self._programs:
@@ -184,10 +191,7 @@ class Worker:
             first = self._compute(segment, trials[:half])
             second = self._compute(segment, trials[half:])
             return _joined(first, second, half, n)
-        # Of a smaller budget only what the settings are ranked by has to be there.
-        study = self.study(segment)
-        names = [m for m, about in study.metrics.items() if not about.optional]
-        finite = np.all([np.isfinite(metrics[m]) for m in names], axis=0)
+        finite = np.all([np.isfinite(metrics[m]) for m in self._needed(segment)], axis=0)
         status = np.where(finite, OK, NON_FINITE).astype(np.int8)
         return metrics, np.broadcast_to(status, (n,)).copy(), state, {}
 

@@ -3,12 +3,14 @@ from __future__ import annotations
 import json
 import sys
 import time
+import types
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from failure import CommandSimulator, FunctionSimulator, Status
+from failure.simulators.processes import SimulatorError
 from failure.simulators.result_cache import Cache
 
 GOOD, FAILED, TIMED_OUT, NOT_FINITE = (
@@ -132,6 +134,17 @@ def test_function_in_worker_processes(tmp_path: Path) -> None:
     assert "singular matrix" in simulate.messages[1]
     simulate(x)
     assert simulate.simulations == 3
+
+
+def test_a_function_that_no_process_can_import_is_an_error_and_not_a_wait(monkeypatch) -> None:
+    """Neither one that cannot be sent at all nor one whose module a new process does not find."""
+    module = types.ModuleType("script_loaded_by_its_path")
+    exec("def lost(x):\n    return [0.0]", module.__dict__)
+    monkeypatch.setitem(sys.modules, module.__name__, module)
+    for function in (lambda x: x, module.lost):
+        simulate = FunctionSimulator(function, 1, retries=0)
+        with pytest.raises(SimulatorError, match="a top-level function of a module"):
+            simulate(np.zeros((1, 1)))
 
 
 @pytest.mark.slow

@@ -54,7 +54,7 @@ def scripted(turn):
 
 @pytest.fixture(scope="module")
 def phase():
-    def run(params, map, states, keys, name, n_trials, max_steps, record):
+    def run(params, map, states, keys, name, n_trials, max_steps, record, first=0):
         turns = {
             "seek": lambda p, r: jnp.clip(r.angle, -30, 30),
             "straight": lambda p, r: 0.0,
@@ -63,10 +63,10 @@ def phase():
         }
         return run_phase(
             scripted(turns[name]), params, map, states, keys=keys,
-            n_trials=n_trials, max_steps=max_steps, record=record,
+            n_trials=n_trials, max_steps=max_steps, record=record, first=first,
         )  # fmt: skip
 
-    return jax.jit(run, static_argnames=("name", "n_trials", "max_steps", "record"))
+    return jax.jit(run, static_argnames=("name", "n_trials", "max_steps", "record", "first"))
 
 
 def test_statuses_steps_and_paths(phase):
@@ -107,6 +107,36 @@ def test_results_do_not_depend_on_the_block(phase):
     _, one = phase(None, PLACE, jnp.zeros((1, 2), jnp.int32), keys(3)[1:2], **args)
     np.testing.assert_array_equal(three.steps[1], one.steps[0])
     np.testing.assert_allclose(three.path[1], one.path[0], rtol=1e-6)
+
+
+def test_a_phase_in_two_parts_is_the_phase_in_one(phase):
+    args = {"name": "seek", "max_steps": 40, "record": False}
+    states = jnp.zeros((3, 2), jnp.int32)
+    state, whole = phase(None, PLACE, states, keys(3), n_trials=2, **args)
+    between, early = phase(None, PLACE, states, keys(3), n_trials=1, **args)
+    end, late = phase(None, PLACE, between, keys(3), n_trials=1, first=1, **args)
+    np.testing.assert_array_equal(end, state)
+    for name in ("status", "steps", "path"):
+        parts = [np.asarray(getattr(part, name)) for part in (early, late)]
+        np.testing.assert_array_equal(np.concatenate(parts, axis=1), getattr(whole, name))
+    assert (early.path != late.path).all()  # other starts
+
+
+def test_a_network_that_waits_for_its_block_learns_nothing():
+    agent, params = snn_agent(SMALL), snn_params(SMALL, PARAMS)
+    reading = world.Reading(jnp.full(5, 300.0), jnp.asarray(100.0), jnp.asarray(30.0))
+
+    @jax.jit
+    def act(state, active):
+        fresh = jnp.asarray(False)
+        return agent.act(params, state, reading, fresh, active, key=jax.random.key(1))[0]
+
+    state = jax.jit(agent.init)(jax.random.key(0), params)
+    waiting, driving = (act(state, jnp.asarray(active)) for active in (False, True))
+    kept = ("weights", "baseline_input", "baseline_hidden")
+    for name in kept:
+        jax.tree.map(np.testing.assert_array_equal, getattr(waiting, name), getattr(state, name))
+    assert (driving.baseline_input.mean != state.baseline_input.mean).any()
 
 
 def test_a_broken_robot_stops_alone(phase):

@@ -17,6 +17,7 @@ from snn_fusion_failure.sweeps import folder, rungs
 from snn_fusion_failure.sweeps.program import compile_study
 from snn_fusion_failure.sweeps.study import load_study
 from tests.snn_fusion_failure.sweep_toy import load, same
+from tests.snn_fusion_failure.test_sweep_studies import SMALL
 
 pytest.importorskip("optuna", reason="extra `sweeps` is not installed")
 pytest.importorskip("cmaes", reason="extra `sweeps` is not installed")
@@ -133,6 +134,7 @@ def test_asha_promotes_the_best_share_of_what_is_done() -> None:
     [
         ("argate", ["model=netgated", "epochs=3"], (0, 1, 3)),
         ("failure", ["n_init=8", "n_total=20", "refit_every=6", "candidates=64"], (0, 12, 20)),
+        ("snn", [*SMALL["snn"], "n_learn=3"], (0, 1, 3)),
     ],
 )
 def test_studies_go_on_from_a_carried_state(name, options, steps) -> None:

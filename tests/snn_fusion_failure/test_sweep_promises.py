@@ -19,8 +19,9 @@ import xarray as xr
 
 from snn_fusion_failure.commands import sweep
 from snn_fusion_failure.runs import files
-from snn_fusion_failure.sweeps import folder, leases, worker
+from snn_fusion_failure.sweeps import chunks, folder, leases, worker
 from snn_fusion_failure.sweeps.chunkfile import DamagedError, load_chunk
+from snn_fusion_failure.sweeps.engine import collect
 from snn_fusion_failure.sweeps.folder import chunk_path, done_chunks, held_sweep
 from snn_fusion_failure.sweeps.rank import rank, table
 from snn_fusion_failure.sweeps.results import setting_scores
@@ -303,6 +304,40 @@ def test_two_commands_share_the_work_and_a_killed_one_is_replaced(tmp_path) -> N
     assert leases.held(out) == set()
 
 
+def test_chunks_that_others_have_are_left_alone_while_there_are_free_ones(
+    whole, tmp_path, monkeypatch
+) -> None:
+    """A crowd does not queue for one chunk: who is late goes where nobody is."""
+    held = sweep.open_sweep(dataclasses.replace(TOY, out=tmp_path, chunk_trials=2))
+    others = [leases.take(tmp_path, f"00000-{i:06d}", 60.0) for i in range(5)]
+    tried, real = [], leases.take
+
+    def take(out: Path, name: str, seconds: float) -> Any:
+        tried.append(name)
+        return real(out, name, seconds)
+
+    def begun(name: str) -> None:
+        if len(done_chunks(tmp_path)) == 6:
+            for lease in others:
+                assert lease is not None
+                lease.release()
+
+    monkeypatch.setattr(chunks.leases, "take", take)
+    assert chunks.run_shard(held, on_start=begun).complete
+    assert tried == [f"00000-{i:06d}" for i in [*range(5, 12), *range(5)]]
+    collect(held)
+    same(load(tmp_path), whole, *VARIABLES)
+
+
+def test_of_a_crowd_that_has_nothing_left_to_claim_most_end(tmp_path, monkeypatch) -> None:
+    held = sweep.open_sweep(dataclasses.replace(TOY, out=tmp_path, chunk_trials=2))
+    for i in range(12):
+        leases.take(tmp_path, f"00000-{i:06d}", 60.0)
+    monkeypatch.setattr(chunks, "WATCHERS", 0)
+    outcome = chunks.run_shard(held)
+    assert not outcome.complete and outcome.errors == ()
+
+
 def test_a_silent_holder_loses_its_lease(tmp_path) -> None:
     mine = leases.take(tmp_path, "x", 60.0)
     assert mine is not None and leases.take(tmp_path, "x", 60.0) is None
@@ -342,18 +377,15 @@ def test_a_raising_setting_fails_alone(whole, tmp_path) -> None:
 
 
 def test_a_metric_named_like_an_axis_is_refused_before(tmp_path) -> None:
-    with pytest.raises(ValueError, match="metric='value': expected a name that no axis has"):
-        study = sweep_toy.make()
-        changed = dataclasses.replace(study, metrics={**study.metrics, "a": study.metrics["value"]})
-        from snn_fusion_failure.sweeps.engine import _check_names
-
-        _check_names(changed, ["value"])
-    (tmp_path / "clash.py").write_text(
-        "def trial(params, key):\n    return {'a': params['a'], 'status': params['a']}\n"
-    )
-    config = sweep.Config(study=f"{tmp_path}/clash.py:trial", grid=("a=1,2",), out=tmp_path / "out")
-    with pytest.raises(ValueError, match="metric='status': expected another name"):
-        sweep.main(config)
+    for name, message in (
+        ("a", "metric='a': expected a name that no axis has"),
+        ("status", "metric='status': expected another name"),
+    ):
+        path = tmp_path / f"clash_{name}.py"
+        path.write_text(f"def trial(params, key):\n    return {{'{name}': params['a']}}\n")
+        config = sweep.Config(study=f"{path}:trial", grid=("a=1,2",), out=tmp_path / "out")
+        with pytest.raises(ValueError, match=message):
+            sweep.main(config)
     assert not (tmp_path / "out").exists()
 
 

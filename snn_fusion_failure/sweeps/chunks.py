@@ -27,7 +27,6 @@ from snn_fusion_failure.sweeps.rungs import is_complete, next_work
 from snn_fusion_failure.sweeps.worker import Worker
 
 
-
 @dataclasses.dataclass(frozen=True)
 class Progress:
     """Where a sweep stands, as it is told after each chunk."""

@@ -127,3 +127,27 @@ def test_avoidance_first_silences_the_target_near_obstacles():
 def test_a_goal_angle_must_be_positive():
     with pytest.raises(ValueError, match="goal_angle=0"):
         rewards.check_rewards(RewardParams(goal_angle=0.0))
+
+
+def test_what_is_nearest_straight_ahead_rewards_the_turn_that_is_made_anyway():
+    """With `commit`; a robot that goes straight on turns left, and a tie with a side is ahead."""
+    params, straight = RewardParams(commit=1.0), jnp.asarray(0.0)
+    to_left, to_right = [-2.1, 2.1], [2.1, -2.1]
+    for turn, want in ((10.0, to_left), (0.0, to_left), (-10.0, to_right)):
+        got = rewards.motor_rewards(params, sonar((2, 20.0)), FAR, straight, jnp.asarray(turn))
+        np.testing.assert_allclose(got, want, rtol=1e-6)
+    tie = sonar((2, 20.0), (4, 20.0))  # by its side alone it would reward turning left
+    got = rewards.motor_rewards(params, tie, FAR, straight, jnp.asarray(-10.0))
+    np.testing.assert_allclose(got, to_right, rtol=1e-6)
+    # What is nearer on a side than ahead, and every obstacle without `commit`, goes by its side.
+    aside = sonar((2, 60.0), (4, 20.0))
+    got = rewards.motor_rewards(params, aside, FAR, straight, jnp.asarray(-10.0))
+    np.testing.assert_allclose(got, to_left, rtol=1e-6)
+    got = rewards.motor_rewards(RewardParams(), tie, FAR, straight, jnp.asarray(-10.0))
+    np.testing.assert_allclose(got, to_left, rtol=1e-6)
+
+
+def test_at_the_border_of_a_range_there_is_no_reward_left():
+    """`d < d_safe` in Eq. 2.9, `d < d_tar` in Eq. 2.10, where what follows is not zero."""
+    assert rewards.avoidance_rewards(RewardParams(), jnp.array([100.0])).tolist() == [[0.0, 0.0]]
+    assert rewards.target_reward(RewardParams(), jnp.array([200.0])).tolist() == [0.0]

@@ -23,7 +23,6 @@ import numpy as np
 
 from snn_fusion_failure.sweeps.chunks import MISSES, longest_pause, stays
 
-
 Way = Literal["dealt", "queue", "leases"]
 _FIRST_PAUSE, _GROWTH = 0.05, 1.5
 

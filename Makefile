@@ -15,7 +15,7 @@ PART   ?= $(shell expr $$(git log -1 --format=%ct 2>/dev/null || date +%s) / 864
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
 
-.PHONY: help demo report test slow commands lint types docs wheel lowest newer check clean
+.PHONY: help demo report test slow mutate commands lint types docs wheel lowest newer check clean
 .DEFAULT_GOAL := help
 
 help:  ## list the commands
@@ -46,6 +46,9 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 
 slow: $(VENV)/.dev  ## a third of the long tests, another third every day
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
+
+mutate: $(VENV)/.dev  ## break the code in some seventy places, one at a time: tests must notice
+	$(BIN)/python scripts/tools/mutate.py
 
 commands: $(VENV)/.dev  ## run the commands of README and docs (a third, another every day) at their smallest size
 	$(BIN)/python scripts/tools/check_commands.py --jobs $(JOBS) --part $(PART)

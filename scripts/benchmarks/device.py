@@ -89,37 +89,63 @@ def parity(tiny: bool) -> dict[str, Any]:
 
 
 def robots(tiny: bool) -> dict[str, Any]:
-    """Milliseconds of plastic synapse updates per second, by robots side by side.
+    r"""Robot-milliseconds per second of the S4 network that learns while its robot drives.
 
-    One robot, 1 ms: each of the S4 network's weights is read and written once (additive STDP with a
-    reward), which bounds the rate by the memory's bandwidth.
+    One robot, 1 ms, all synapses plastic, world included: `jaxsnn.run_phase` with all robots in one
+    block. In each window of W ms a synapse's weight is read for the currents, its trace is read and
+    written, and its weight is read and written by the reward: at least 20 bytes, so that
+
+    .. math:: \text{rate} \le \frac{W B}{20 n}, \qquad B \text{ bytes/s copied}, n \text{ synapses}
     """
     import jax
     import jax.numpy as jnp
 
-    synapses = 1_000 if tiny else 44_308  # of S4, all plastic
+    from jaxsnn import preset, run_phase, scenario, snn_agent, snn_params
+
+    size = {"hidden_exc": 12, "hidden_inh": 12, "group_exc": 4, "group_inh": 4} if tiny else {}
+    window, steps = (20, 2) if tiny else (100, 8)
+    config, constants = preset(
+        "S4", "tuned", config={**size, "control_steps": window, "hold_steps": window}
+    )
+    agent, params = snn_agent(config), snn_params(config, constants)
+    # A robot that stands still neither arrives nor collides: every trial has all its steps.
+    map = scenario(1)._replace(speed=jnp.zeros(()))
+
+    @functools.partial(jax.jit, donate_argnums=0)
+    def drive(states: Any, keys: Any) -> Any:
+        return run_phase(agent, params, map, states, keys=keys, n_trials=1, max_steps=steps)
+
+    @jax.jit
+    def begin(keys: Any) -> Any:
+        return jax.vmap(lambda key: agent.init(key, params))(keys)
+
     copied = bandwidth(tiny)
     rows: list[dict[str, Any]] = []
     for count in (8, 16) if tiny else (1024, 2048, 4096, 8192, 16384):
-        w = jnp.zeros((count, synapses), jnp.float32)
-        spikes = jnp.ones((count, synapses), bool)
-
-        @jax.jit
-        def window(w: Any, spikes: Any) -> Any:
-            def step(w: Any, t: Any) -> Any:
-                return jnp.clip(w + jnp.where(spikes, 1e-3, -1e-3) * t, 0.0, 1.0), None
-
-            return jax.lax.scan(step, w, jnp.arange(10, dtype=jnp.float32))[0]
-
+        keys = jax.random.split(jax.random.key(0), count)
         try:
-            seconds = _timed(functools.partial(window, w, spikes), 3)
+            held, result = drive(begin(keys), keys)
+            synapses = sum(w[0].size for w in held.weights)
+            seconds = []
+            for _ in range(3):
+                start = time.perf_counter()
+                held, result = jax.block_until_ready(drive(held, keys))
+                seconds.append(time.perf_counter() - start)
+            done = int(result.steps.sum())
         except Exception as error:
             rows.append({"robots": count, "error": str(error).splitlines()[0][:200]})
             continue
-        rate = count * 10 / seconds
-        share = rate * synapses * 9.0 / copied
-        rows.append({"robots": count, "robot_ms_per_s": rate, "share_of_bandwidth": share})
-    return {"bytes_per_s": copied, "synapses": synapses, "rows": rows}
+        rate = done * window / min(seconds)
+        moved = 20.0 * synapses / window
+        rows.append({
+            "robots": count, "robot_ms_per_s": rate, "synapses": synapses,
+            "bytes_per_robot_ms": moved, "share_of_bandwidth": rate * moved / copied,
+        })  # fmt: skip
+        line = (
+            f"{count} robots: {rate:.3g} robot-ms/s, {rate * moved / copied:.1%} of the bandwidth"
+        )
+        print(line, flush=True)
+    return {"bytes_per_s": copied, "window_ms": window, "rows": rows}
 
 
 def fusion_tables(tiny: bool) -> dict[str, Any]:
@@ -226,6 +252,8 @@ def run_part(name: str, config: Config, seconds: float) -> dict[str, Any]:
         line = f"not done within {seconds:.0f} s"
     if line:
         write_json(path, {"part": name, "missing": line})
+    elif done.stdout:
+        print(done.stdout, end="", flush=True)
     found = json.loads(path.read_text(encoding="utf-8"))
     print(f"{name}: {time.monotonic() - start:.0f} s, {found.get('missing', 'done')}", flush=True)
     return dict(found)

@@ -17,7 +17,12 @@ def test_a_part_writes_its_file_at_once_and_a_crash_is_a_line(tmp_path, monkeypa
     found = device.main(config)
     rows = found["robots"]["rows"]
     assert [row["robots"] for row in rows] == [8, 16]
-    assert all(row["robot_ms_per_s"] > 0 and row["share_of_bandwidth"] > 0 for row in rows)
+    copied = found["robots"]["bytes_per_s"]
+    for row in rows:
+        # The network's own: 7 groups of 8 inputs onto 24 hidden neurons, 12 of them per motor.
+        assert row["synapses"] == 56 * 24 + 2 * 12
+        wanted = row["robot_ms_per_s"] * 20.0 * row["synapses"] / 20 / copied
+        assert row["share_of_bandwidth"] == pytest.approx(wanted) and wanted > 0
     assert found["sweep"]["complete"] and found["sweep"]["trials"] == 8
     held = json.loads((tmp_path / "robots.json").read_text())
     assert {"device", "git", "versions"} <= set(held)

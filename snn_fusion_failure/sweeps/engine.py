@@ -103,7 +103,7 @@ def build(
     budgets = tuple(choices.pop("budgets", ()))
     sweep = Sweep(
         out, study, made, seeds, budgets=budgets, metrics=study.metrics,
-        objective=study.objective, rung_objective=_rung_objective(study, budgets),
+        objective=study.objective, rung_objective=study.rung_objective(budgets),
         budget_text=study.budget_text, study_name=study.name, options=study.options,
         where=folder_of(study.source), **choices,
     )  # fmt: skip
@@ -116,15 +116,6 @@ def build(
         adaptive.check_adaptive(sweep)
     _check_settings(sweep)
     return sweep
-
-
-def _rung_objective(study: Study, budgets: Sequence[int]) -> str:
-    """What settings are ranked by before they have all of their training."""
-    if budgets and study.carry is not None:
-        return study.carry.objective or study.objective
-    if budgets and study.with_budget is not None:
-        return study.with_budget(budgets[0]).objective
-    return study.objective
 
 
 def _check_names(study: Study, leaves: Sequence[str]) -> None:

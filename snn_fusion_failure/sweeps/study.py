@@ -110,6 +110,14 @@ class Study:
         """Names of what can be swept without compiling anew."""
         return leaf_names(self.params)
 
+    def rung_objective(self, budgets: Sequence[int]) -> str:
+        """What settings are ranked by before they have all of their training."""
+        if budgets and self.carry is not None:
+            return self.carry.objective or self.objective
+        if budgets and self.with_budget is not None:
+            return self.with_budget(budgets[0]).objective
+        return self.objective
+
     def axis_of(self, name: str) -> tuple[str, Any, Any]:
         """Leaf or option that a name means, the kind of its axis, and its default.
 

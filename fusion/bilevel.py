@@ -18,11 +18,12 @@ Batch = tuple[Array, ...]
 
 
 def held_out_gradient(
-    penalized: Callable[[Params, Batch], Float[Array, ""]],
-    main: Callable[[Params, Batch], Float[Array, ""]],
     params: Params,
     batch: Batch,
     rate: float | Array,
+    *,
+    penalized: Callable[[Params, Batch], Float[Array, ""]],
+    main: Callable[[Params, Batch], Float[Array, ""]],
 ) -> Any:
     r"""Gradient of the main loss after one step, in the parameters of the targets.
 
@@ -32,10 +33,10 @@ def held_out_gradient(
     A is the first half of the batch, B the second: the step is unrolled, and differentiated.
 
     Args:
-        penalized: whole loss of parameters and a batch; main: the main loss alone.
         params: with the targets' under `"targets"`.
         batch: arrays with the examples first.
         rate: of the step.
+        penalized: whole loss of parameters and a batch; main: the main loss alone.
 
     Returns:
         A tree like `params["targets"]`.

@@ -169,11 +169,11 @@ def train_step(
 
         seen_by = jnp.zeros((len(y), 1), bool) if excluded is None else excluded
         grads["targets"] = held_out_gradient(
-            lambda p, batch: terms_of(p, batch).total,
-            lambda p, batch: terms_of(p, batch).main,
             trained,
             (x, y, failed, seen_by),
             rate,
+            penalized=lambda p, batch: terms_of(p, batch).total,
+            main=lambda p, batch: terms_of(p, batch).main,
         )
     updates, opt_state = _optimizer(config).update(grads, state.opt_state, trained)
     params: Params = {}

@@ -1,17 +1,19 @@
 """Studies beside Tables 3.1 to 3.6: other splits, signals, failures on known readings, mixtures.
 
+    python scripts/studies/study_sensors.py --study driver_heads
     python scripts/studies/study_sensors.py --study driver_trip
     python scripts/studies/study_sensors.py --study driver_tagged
     python scripts/studies/study_sensors.py --study known_readings
     python scripts/studies/study_sensors.py --study kept_out_kinds --seeds 2
     python scripts/studies/study_sensors.py --study gate_targets
 
+`driver_heads` has the driver's neighbourhood head and the signals of the default set;
 `driver_trip` holds out whole trips; `driver_tagged` has the earlier stand-ins, one of which names
 trips; `known_readings` lets sensors fail on values that they give when they work, with and without
 the feature that tells known readings; `kept_out_kinds` trains HAR on all kinds of failure but one
 and tests on that one; `gate_targets` compares what the gate can learn from. Each training is kept
 as it comes in `runs/study_sensors`, so the same command goes on after an interruption. Writes
-`results/study_NAME.json`.
+`results/study_NAME.json`; `above_equal_weights` in it is a difference seed by seed.
 """
 
 from __future__ import annotations
@@ -50,6 +52,10 @@ def _driver(name: str, n_clean: int, models: tuple[str, ...], **options: Any) ->
 
 
 _HEAD = ("equal_weights", "argate_plus", "forest_ceiling")
+_ALL = (
+    *("equal_weights", "netgated", "argate_plus", "argate_l", "argate_plus_printed"),
+    *("argate_l_printed", "oracle", "forest_ceiling", "nearest_rows", "linear_fit"),
+)
 _GATES = {
     "as in the preset": (),
     "kl": ("model.loss.imitation=kl",),
@@ -70,6 +76,11 @@ def _without_flag(n_clean: int, kind: str) -> list[Case]:
 
 
 STUDIES: dict[str, tuple[str, list[Case]]] = {
+    "driver_heads": (
+        "Driver identification without a signal that names trips, neighbourhood head, accuracy %",
+        [_driver(f"n_clean={n} uniform", n, _ALL) for n in (12, 8, 5)]
+        + [_driver(f"n_clean={n} gaussian", n, _ALL[:-3], kind="gaussian") for n in (12, 8, 5)],
+    ),
     "driver_trip": (
         "Driver identification, whole trips held out, accuracy %",
         [_driver(f"n_clean={n} uniform", n, _HEAD, split="trip") for n in (12, 8, 5)],
@@ -115,7 +126,7 @@ class Config:
     """Run one of the studies."""
 
     study: str = "driver_trip"
-    """driver_trip, driver_tagged, known_readings, kept_out_kinds or gate_targets."""
+    """driver_heads, driver_trip, driver_tagged, known_readings, kept_out_kinds or gate_targets."""
     preset: str = "paper"
     seeds: int = 5
     """Trainings per cell."""
@@ -205,19 +216,25 @@ def collect(config: Config) -> list[dict[str, Any]]:
     """Rows of the study in the schema of record, from the runs on disk."""
     from snn_fusion_failure.records.fusion_tables import METRICS
 
-    held: dict[tuple[str, str], list[dict[str, Any]]] = {}
+    held: dict[tuple[str, str], dict[int, dict[str, Any]]] = {}
     for run in runs(config):
         path = run.path(config.out)
         if path.exists():
             record = json.loads(path.read_text(encoding="utf-8"))
-            held.setdefault((run.case.name, run.model), []).append(record)
+            held.setdefault((run.case.name, run.model), {})[run.seed] = record
     rows = []
-    for (name, model), records in held.items():
-        for metric in METRICS:
-            values = [record.get(metric) for record in records]
-            if any(value is None for value in values):
+    for (name, model), by_seed in held.items():
+        equal = held.get((name, "equal_weights"), {})
+        if model not in ("equal_weights", "forest_ceiling", "nearest_rows", "linear_fit"):
+            for seed in set(equal) & set(by_seed):
+                gain = by_seed[seed]["accuracy"] - equal[seed]["accuracy"]
+                by_seed[seed]["above_equal_weights"] = gain
+        records = list(by_seed.values())
+        for metric in (*METRICS, "above_equal_weights"):
+            values = [r[metric] for r in records if r.get(metric) is not None]
+            if not values or (metric in METRICS and len(values) < len(records)):
                 continue
-            unit = "%" if metric.startswith("accuracy") else "1"
+            unit = "1" if metric.startswith("gate") else "%"
             cell = {"row": name, "model": model, "metric": metric, "unit": unit}
             rows.append(cell | summarize(values))
     return rows

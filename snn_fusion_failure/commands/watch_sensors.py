@@ -174,10 +174,10 @@ def follow(
                 time.sleep(max(0.0, 1.0 / config.rate - took[-1]))
     assert answer is not None
     if config.picture is not None:
-        from snn_fusion_failure.records.plots import animate_stream
+        from snn_fusion_failure.records.plots import plot_stream
 
         config.picture.parent.mkdir(parents=True, exist_ok=True)
-        moving = animate_stream(np.asarray(weights), np.asarray(risks), fitted.channels)
+        moving = plot_stream(np.asarray(weights), np.asarray(risks), fitted.channels)
         moving.save(config.picture, writer="pillow", fps=20)
     # The first answer compiles.
     return {

@@ -159,7 +159,10 @@ def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Done:
         enable_compilation_cache()
         names = {run.row.settings["dataset"] for run in todo}
         try:
-            datasets = {name: load(name, plan.data_dir) for name in sorted(names)}
+            datasets = {
+                name: load(name, plan.data_dir, features="tagged" if name == "driver" else None)
+                for name in sorted(names)
+            }
         except FileNotFoundError as error:
             if not plan.piece:
                 raise

@@ -20,7 +20,9 @@ if TYPE_CHECKING:
 FIVE = ("baseline", "netgated", "argate_ws", "argate_plus", "argate_l")
 PRINTED = ("argate_plus_printed", "argate_l_printed")
 REFERENCES = ("oracle", "modality_dropout", "embracenet")
-DRIVER_REFERENCES = ("equal_weights", *PRINTED, "oracle", *CEILINGS)
+DRIVER_REFERENCES = (*PRINTED, "oracle", *CEILINGS)
+DRIVER = {"dataset": "driver", "features": "tagged", "head": "dense"}
+"""Signals and head of Tables 3.4 to 3.6 on record; `scripts/studies/study_sensors.py` has newer."""
 UNSEEN_KINDS: tuple[FailureKind, ...] = ("zero", "stuck", "drift", "dropout", "gain", "clip")
 
 
@@ -31,8 +33,7 @@ class Row:
     Attributes:
         name: as the source's table spells it.
         settings: fields of `train_argate.Config` that differ from its defaults.
-        references: these columns, too. `equal_weights` is the baseline of the driver's
-            neighbourhood head; `baseline` there has dense layers as in the source.
+        references: these columns, too.
         robustness: also score under the failure kinds that are never trained on.
         channel: keep this channel's fusion weights (Figure 3.7).
     """
@@ -44,8 +45,12 @@ class Row:
     channel: str | None = None
 
 
+def _data(dataset: str) -> dict[str, Any]:
+    return dict(DRIVER) if dataset == "driver" else {"dataset": dataset}
+
+
 def _random(dataset: str, n_clean: int, kind: str, **options: Any) -> Row:
-    settings = {"dataset": dataset, "protocol": "random", "n_clean": n_clean, "kind": kind}
+    settings = _data(dataset) | {"protocol": "random", "n_clean": n_clean, "kind": kind}
     references = (*PRINTED, *options.pop("references", ()))
     if dataset == "driver":  # the ceilings do not depend on how sensors fail
         references = DRIVER_REFERENCES[: None if kind == "uniform" else -len(CEILINGS)]
@@ -53,19 +58,13 @@ def _random(dataset: str, n_clean: int, kind: str, **options: Any) -> Row:
 
 
 def _ranges(dataset: str, train: tuple[int, int], test: tuple[int, int]) -> Row:
-    settings = {
-        "dataset": dataset,
-        "protocol": "generalisation",
-        "train_range": train,
-        "test_range": test,
-    }
-    references = ("equal_weights",) if dataset == "driver" else ()
-    return Row(f"({train[0]},{train[1]})({test[0]},{test[1]})", settings, references)
+    ranges = {"protocol": "generalisation", "train_range": train, "test_range": test}
+    return Row(f"({train[0]},{train[1]})({test[0]},{test[1]})", _data(dataset) | ranges)
 
 
 def _fixed(dataset: str, n_clean: int) -> Row:
-    references = ("equal_weights", "forest_ceiling") if dataset == "driver" else ()
-    settings = {"dataset": dataset, "protocol": "fixed", "n_clean": n_clean}
+    references = ("forest_ceiling",) if dataset == "driver" else ()
+    settings = _data(dataset) | {"protocol": "fixed", "n_clean": n_clean}
     return Row(f"n_clean={n_clean}", settings, references)
 
 
@@ -97,14 +96,10 @@ TABLES: dict[str, tuple[str, tuple[Row, ...]]] = {
     "3.5": (
         "Driver identification, clean and random failing sensor assignment, accuracy %",
         (
-            Row(
-                "clean",
-                {"dataset": "driver", "protocol": "clean"},
-                ("equal_weights", "forest_ceiling"),
-            ),
+            Row("clean", DRIVER | {"protocol": "clean"}, ("forest_ceiling",)),
             _random("driver", 12, "uniform"),
             _random("driver", 12, "gaussian"),
-            _random("driver", 8, "uniform"),
+            _random("driver", 8, "uniform", robustness=True),
             _random("driver", 8, "gaussian"),
             _random("driver", 5, "uniform"),
             _random("driver", 5, "gaussian"),
@@ -160,8 +155,7 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
     if run.model in CEILINGS:
         (case,) = build_cases(Config(**run.row.settings), dataset).values()
         return score(run.model, dataset, case.noise, run.seed)
-    head = "dense" if run.model == "baseline" else None
-    config = Config(model=run.model, preset=preset, seed=run.seed, head=head, **run.row.settings)
+    config = Config(model=run.model, preset=preset, seed=run.seed, **run.row.settings)
     settings = build_settings(config, dataset)
     (case,) = build_cases(config, dataset).values()
     fitted, output = train_and_test(settings, dataset, case.noise, run.seed)

@@ -15,7 +15,7 @@ from matplotlib.figure import Figure
 from fusion.plots import CLEAN, FAILED
 
 
-def animate_stream(
+def plot_stream(
     weights: Float[ArrayLike, "n k"],
     risks: Float[ArrayLike, "n k"],
     channels: Sequence[str],

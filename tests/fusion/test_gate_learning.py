@@ -54,7 +54,7 @@ def test_the_unrolled_gradient_is_that_of_finite_differences() -> None:
 
     params = {"main": jnp.float32(0.3), "targets": jnp.float32(0.8)}
     x = jnp.array([1.0, 2.0, -1.0, 0.5])
-    found = held_out_gradient(penalized, main, params, (x,), 0.1)
+    found = held_out_gradient(params, (x,), 0.1, penalized=penalized, main=main)
 
     def after(f: float) -> float:
         moved = 0.3 - 0.1 * np.mean(2.0 * (0.3 - f * np.array([1.0, 2.0])))

@@ -48,7 +48,6 @@ LONGER = {
     "jaxsnn.ppo",
     "jaxsnn.world",
     "snn_fusion_failure.documentation.documented",
-    "snn_fusion_failure.sweeps.folder",
     "scripts.benchmarks.bench_fusion",
     "scripts.benchmarks.bench_snn",
     "scripts.studies.study_sigma",

@@ -15,8 +15,8 @@ from typing import Any
 import numpy as np
 
 from snn_fusion_failure.sweeps.axes import Axis
+from snn_fusion_failure.sweeps.definition import Sweep
 from snn_fusion_failure.sweeps.designs import digest, shares
-from snn_fusion_failure.sweeps.folder import Sweep
 
 Row = tuple[Any, ...]
 

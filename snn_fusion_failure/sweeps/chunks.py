@@ -11,17 +11,10 @@ import numpy as np
 
 from snn_fusion_failure.sweeps import leases
 from snn_fusion_failure.sweeps.chunkfile import DamagedError, set_aside
+from snn_fusion_failure.sweeps.definition import Segment, Sweep
 from snn_fusion_failure.sweeps.designs import ADAPTIVE
-from snn_fusion_failure.sweeps.folder import (
-    Segment,
-    Sweep,
-    all_chunks,
-    chunk_name,
-    chunk_path,
-    done_chunks,
-    read_plan,
-    segments_of,
-)
+from snn_fusion_failure.sweeps.folder import chunk_name, chunk_path, done_chunks
+from snn_fusion_failure.sweeps.plan import all_chunks, read_plan, segments_of
 from snn_fusion_failure.sweeps.results import Reader
 from snn_fusion_failure.sweeps.rungs import is_complete, next_work
 from snn_fusion_failure.sweeps.worker import Worker

@@ -18,16 +18,9 @@ from snn_fusion_failure.sweeps import adaptive, rungs
 from snn_fusion_failure.sweeps.axes import Axis
 from snn_fusion_failure.sweeps.chunkfile import set_aside
 from snn_fusion_failure.sweeps.chunks import Progress, run_shard
+from snn_fusion_failure.sweeps.definition import FAILED, MISSING, NON_FINITE, Sweep
 from snn_fusion_failure.sweeps.designs import ADAPTIVE, design, shares
-from snn_fusion_failure.sweeps.folder import (
-    FAILED,
-    MISSING,
-    NON_FINITE,
-    Sweep,
-    claim,
-    forget,
-    held_sweep,
-)
+from snn_fusion_failure.sweeps.folder import claim, forget, held_sweep
 from snn_fusion_failure.sweeps.gather import RESERVED, damaged, gather, write_netcdf
 from snn_fusion_failure.sweeps.leaves import batch
 from snn_fusion_failure.sweeps.rank import rank

@@ -6,7 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.runs.files import write_bytes, write_text
-from snn_fusion_failure.sweeps.folder import STATUS
+from snn_fusion_failure.sweeps.definition import STATUS
 
 
 def frame(dataset: Any) -> Any:

@@ -15,156 +15,19 @@ from __future__ import annotations
 
 import contextlib
 import dataclasses
-import functools
 import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
-
-import numpy as np
 
 from snn_fusion_failure.runs import provenance, to_jsonable
 from snn_fusion_failure.runs.files import create_once
 from snn_fusion_failure.sweeps.axes import Axis
-from snn_fusion_failure.sweeps.designs import Design, digest
+from snn_fusion_failure.sweeps.definition import SCHEME, Sweep
+from snn_fusion_failure.sweeps.designs import Design
+from snn_fusion_failure.sweeps.plan import read_plan
 from snn_fusion_failure.sweeps.study import Metric, Study
-
-OK, NON_FINITE, FAILED, MISSING = 0, 1, 2, 3
-STATUS = ("ok", "non-finite", "failed", "missing")
-SCHEME = 2
-"""How keys follow from settings; numbers of another scheme are another sweep."""
-
-
-@dataclasses.dataclass(frozen=True)
-class Segment:
-    """Settings times seeds on one budget, in chunks: what was planned at one time.
-
-    Attributes:
-        number: of the segment in its folder.
-        budget: units of training; None: all of them.
-        settings: numbers of settings, all with the same static values.
-        seeds: the first, and one after the last.
-    """
-
-    number: int
-    budget: int | None
-    settings: tuple[int, ...]
-    seeds: tuple[int, int]
-
-    @functools.cached_property
-    def trials(self) -> np.ndarray:
-        """Setting and seed of each trial, `[n, 2]`."""
-        seeds = np.arange(*self.seeds)
-        settings = np.asarray(self.settings, np.int64)
-        return np.stack([np.repeat(settings, len(seeds)), np.tile(seeds, len(settings))], 1)
-
-    def n_chunks(self, sweep: Sweep) -> int:
-        """Chunks of this segment."""
-        return -(-len(self.settings) * (self.seeds[1] - self.seeds[0]) // sweep.chunk_trials)
-
-    def chunk(self, sweep: Sweep, number: int) -> np.ndarray:
-        """Trials of a chunk."""
-        return self.trials[number * sweep.chunk_trials : (number + 1) * sweep.chunk_trials]
-
-
-@dataclasses.dataclass(frozen=True)
-class Sweep:
-    """A sweep as its folder has it.
-
-    Attributes:
-        out: the folder.
-        study: what a trial is; None where the folder is only looked at.
-        design: what was asked for last.
-        seeds: trials per setting.
-        root: seed of all keys.
-        chunk_trials: trials per file.
-        width: trials side by side on a device.
-        budgets: units of training after which settings are dropped; empty without halving.
-        keep: share of the settings that stay at each of them.
-        mode: `halving` waits for a whole rung, `asha` promotes whenever there is something to.
-        common: seed k draws the same numbers in every setting.
-        min_valid: share of a setting's seeds that must be valid for it to be ranked.
-        batch: settings that an adaptive design asks for at a time.
-        metrics, objective, budget_text: of the study.
-        rung_objective: what settings are ranked by before they have all of their training.
-        study_name, options, where: from which the study is made again.
-        allow_mixed: chunks of other sources may stand beside.
-        lease: seconds after which a silent worker's chunk is taken over.
-    """
-
-    out: Path
-    study: Study | None
-    design: Design
-    seeds: int
-    root: int = 0
-    chunk_trials: int = 1
-    width: int = 1
-    budgets: tuple[int, ...] = ()
-    keep: float = 0.25
-    mode: str = "halving"
-    common: bool = False
-    min_valid: float = 0.75
-    batch: int = 8
-    metrics: Mapping[str, Metric] = dataclasses.field(default_factory=dict)
-    objective: str = ""
-    rung_objective: str = ""
-    budget_text: str = ""
-    study_name: str = ""
-    options: Mapping[str, Any] = dataclasses.field(default_factory=dict)
-    where: str | None = None
-    allow_mixed: bool = False
-    lease: float = 60.0
-
-    @property
-    def leaves(self) -> tuple[str, ...]:
-        """Names of the axes."""
-        return tuple(axis.leaf for axis in self.design.axes)
-
-    @property
-    def static(self) -> tuple[str, ...]:
-        """Names of the axes that compile anew."""
-        return tuple(axis.leaf for axis in self.design.axes if axis.kind == "static")
-
-    def static_values(self, row: Sequence[Any]) -> dict[str, Any]:
-        """The static values of a setting."""
-        return {a.leaf: v for a, v in zip(self.design.axes, row, strict=True) if a.kind == "static"}
-
-    def columns(self, rows: Sequence[Sequence[Any]]) -> dict[str, np.ndarray]:
-        """Numbers of the traced axes for some settings, in the axes' units."""
-        found = {}
-        for i, axis in enumerate(self.design.axes):
-            if axis.kind == "category":
-                found[axis.leaf] = np.asarray([axis.values.index(row[i]) for row in rows], float)
-            elif axis.kind != "static":
-                found[axis.leaf] = np.asarray([row[i] for row in rows], np.float64)
-        return found
-
-    def words(self, rows: Sequence[Sequence[Any]]) -> np.ndarray:
-        """The words that keys are folded from, `[n, 2]` uint32."""
-        found = [digest(self.leaves, row) for row in rows]
-        return np.asarray(found, np.uint32).reshape(-1, 2)
-
-    def settings(self) -> dict[str, Any]:
-        """What cannot change while the sweep grows, JSON values."""
-        value = {
-            "scheme": SCHEME,
-            "study": self.study_name,
-            "options": self.options,
-            "axes": [
-                {"leaf": a.leaf, "unit": a.unit, "kind": a.kind} for a in self.design.axes
-            ],
-            # Labels are counted: another order would be another meaning.
-            "labels": {a.leaf: a.values for a in self.design.axes if a.kind == "category"},
-            "root": self.root,
-            "common_seeds": self.common,
-            "halving": {"budgets": self.budgets, "keep": self.keep, "mode": self.mode,
-                        "min_valid": self.min_valid} if self.budgets else None,
-            "adaptive": {"kind": self.design.kind, "batch": self.batch, "seed": self.design.seed,
-                         "min_valid": self.min_valid}
-            if self.design.kind in ("tpe", "cma", "gp") else None,
-        }  # fmt: skip
-        return dict(json.loads(json.dumps(to_jsonable(value))))
 
 
 def claim(sweep: Sweep, **layout: Any) -> Sweep:
@@ -289,52 +152,6 @@ def held_sweep(out: Path, *, load: bool = False, **changes: Any) -> Sweep:
     )  # fmt: skip
 
 
-def read_plan(out: Path) -> list[dict[str, Any]]:
-    """All parts of the plan, in order."""
-    folder = out / "plan"
-    if not folder.is_dir():
-        return []
-    names = sorted(n for n in os.listdir(folder) if n.endswith(".json") and not n.startswith("."))
-    return [json.loads((folder / name).read_text(encoding="utf-8")) for name in names]
-
-
-def append_plan(
-    sweep: Sweep,
-    rows: Sequence[Sequence[Any]],
-    segments: Sequence[Mapping[str, Any]],
-    *,
-    after: int,
-) -> bool:
-    """Append settings and segments; of several processes one does.
-
-    Args:
-        sweep: its design and seeds are noted as what is asked for now.
-        rows: settings that are new.
-        segments: `budget`, `settings` and `seeds` of each new segment.
-        after: parts of the plan that this follows from.
-
-    Returns:
-        Whether this call did; otherwise the plan has to be read again.
-    """
-    text = {
-        "design": {**sweep.design.describe(), "seeds": sweep.seeds},
-        "rows": rows,
-        "segments": list(segments),
-        "command": provenance()["command"],
-    }
-    path = sweep.out / "plan" / f"{after:06d}.json"
-    return create_once(path, json.dumps(to_jsonable(text), allow_nan=False) + "\n")
-
-
-def segments_of(plan: Sequence[Mapping[str, Any]]) -> list[Segment]:
-    """The segments of a plan, numbered."""
-    found: list[Segment] = []
-    for part in plan:
-        for s in part["segments"]:
-            found.append(Segment(len(found), s["budget"], tuple(s["settings"]), tuple(s["seeds"])))
-    return found
-
-
 def forget(out: Path) -> None:
     """Delete the sweep in a folder, and nothing else that is in it."""
     for pattern in (
@@ -366,14 +183,3 @@ def done_chunks(out: Path) -> set[tuple[int, int]]:
                 segment, _, number = name.removesuffix(".npz").partition("-")
                 found.add((int(segment), int(number)))
     return found
-
-
-def all_chunks(sweep: Sweep) -> list[tuple[Segment, int]]:
-    """Every chunk that is planned, in order."""
-    segments = segments_of(read_plan(sweep.out))
-    return [(s, number) for s in segments for number in range(s.n_chunks(sweep))]
-
-
-def valid(status: np.ndarray, values: np.ndarray) -> np.ndarray:
-    """Trials that count in a mean: they ended well, with a finite number."""
-    return (status == OK) & np.isfinite(values)

@@ -10,17 +10,10 @@ import numpy as np
 
 from snn_fusion_failure.runs.files import write_bytes
 from snn_fusion_failure.sweeps.chunkfile import DamagedError
+from snn_fusion_failure.sweeps.definition import MISSING, STATUS, Sweep
 from snn_fusion_failure.sweeps.designs import digest
-from snn_fusion_failure.sweeps.folder import (
-    MISSING,
-    STATUS,
-    Sweep,
-    all_chunks,
-    chunk_path,
-    done_chunks,
-    read_plan,
-    segments_of,
-)
+from snn_fusion_failure.sweeps.folder import chunk_path, done_chunks
+from snn_fusion_failure.sweeps.plan import all_chunks, read_plan, segments_of
 from snn_fusion_failure.sweeps.results import Found, Reader
 from snn_fusion_failure.sweeps.rungs import is_complete
 

@@ -19,16 +19,9 @@ from typing import Any
 from snn_fusion_failure.runs import enable_compilation_cache
 from snn_fusion_failure.sweeps import leases
 from snn_fusion_failure.sweeps.chunks import Progress, run_shard
-from snn_fusion_failure.sweeps.folder import (
-    Sweep,
-    all_chunks,
-    chunk_name,
-    chunk_path,
-    done_chunks,
-    held_sweep,
-    read_plan,
-    segments_of,
-)
+from snn_fusion_failure.sweeps.definition import Sweep
+from snn_fusion_failure.sweeps.folder import chunk_name, chunk_path, done_chunks, held_sweep
+from snn_fusion_failure.sweeps.plan import all_chunks, read_plan, segments_of
 from snn_fusion_failure.sweeps.results import Reader
 from snn_fusion_failure.sweeps.rungs import next_work
 from snn_fusion_failure.sweeps.worker import Worker

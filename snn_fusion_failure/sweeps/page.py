@@ -16,7 +16,7 @@ import numpy as np
 
 from snn_fusion_failure.runs import to_jsonable
 from snn_fusion_failure.runs.files import write_text
-from snn_fusion_failure.sweeps.folder import STATUS, valid
+from snn_fusion_failure.sweeps.definition import STATUS, valid
 from snn_fusion_failure.sweeps.rank import axis_columns, mean_of, per_setting
 
 

@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from snn_fusion_failure.records.rows import summarize
-from snn_fusion_failure.sweeps.folder import FAILED, NON_FINITE, STATUS, valid
+from snn_fusion_failure.sweeps.definition import FAILED, NON_FINITE, STATUS, valid
 from snn_fusion_failure.sweeps.results import setting_scores
 
 

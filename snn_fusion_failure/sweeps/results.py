@@ -11,15 +11,8 @@ from typing import Any
 import numpy as np
 
 from snn_fusion_failure.sweeps.chunkfile import load_chunk
-from snn_fusion_failure.sweeps.folder import (
-    MISSING,
-    Segment,
-    Sweep,
-    chunk_name,
-    chunk_path,
-    done_chunks,
-    valid,
-)
+from snn_fusion_failure.sweeps.definition import MISSING, Segment, Sweep, valid
+from snn_fusion_failure.sweeps.folder import chunk_name, chunk_path, done_chunks
 
 
 @dataclasses.dataclass

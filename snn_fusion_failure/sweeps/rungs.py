@@ -20,17 +20,10 @@ import numpy as np
 from snn_fusion_failure.runs import to_jsonable
 from snn_fusion_failure.sweeps.adaptive import ask
 from snn_fusion_failure.sweeps.chunkfile import DamagedError
+from snn_fusion_failure.sweeps.definition import MISSING, Segment, Sweep
 from snn_fusion_failure.sweeps.designs import ADAPTIVE, digest
-from snn_fusion_failure.sweeps.folder import (
-    MISSING,
-    Segment,
-    Sweep,
-    all_chunks,
-    append_plan,
-    done_chunks,
-    read_plan,
-    segments_of,
-)
+from snn_fusion_failure.sweeps.folder import done_chunks
+from snn_fusion_failure.sweeps.plan import all_chunks, append_plan, read_plan, segments_of
 from snn_fusion_failure.sweeps.results import Reader, setting_scores
 
 Work = tuple[list[tuple[Any, ...]], list[dict[str, Any]]]

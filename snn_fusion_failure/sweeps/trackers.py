@@ -12,7 +12,7 @@ from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
 from snn_fusion_failure.sweeps.chunkfile import DamagedError
-from snn_fusion_failure.sweeps.folder import MISSING, Sweep
+from snn_fusion_failure.sweeps.definition import MISSING, Sweep
 from snn_fusion_failure.sweeps.gather import gather
 from snn_fusion_failure.sweeps.rank import axis_columns, mean_of, per_setting
 from snn_fusion_failure.sweeps.results import Reader

@@ -11,17 +11,9 @@ import numpy as np
 from snn_fusion_failure.runs.files import create_once
 from snn_fusion_failure.runs.origin import provenance
 from snn_fusion_failure.sweeps.chunkfile import DamagedError, load_chunk, save_chunk
-from snn_fusion_failure.sweeps.folder import (
-    FAILED,
-    NON_FINITE,
-    OK,
-    Segment,
-    Sweep,
-    chunk_path,
-    done_chunks,
-    read_plan,
-    segments_of,
-)
+from snn_fusion_failure.sweeps.definition import FAILED, NON_FINITE, OK, Segment, Sweep
+from snn_fusion_failure.sweeps.folder import chunk_path, done_chunks
+from snn_fusion_failure.sweeps.plan import read_plan, segments_of
 from snn_fusion_failure.sweeps.program import Program, compile_study, out_of_memory
 from snn_fusion_failure.sweeps.source import changes, fingerprint
 from snn_fusion_failure.sweeps.study import Study

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from snn_fusion_failure.commands import sweep
-from snn_fusion_failure.sweeps import designs, folder, gather, program, rungs
+from snn_fusion_failure.sweeps import definition, designs, folder, gather, plan, program, rungs
 from snn_fusion_failure.sweeps.chunks import run_shard
 from snn_fusion_failure.sweeps.folder import done_chunks, held_sweep
 from snn_fusion_failure.sweeps.results import Reader
@@ -81,7 +81,7 @@ def test_data_set_says_what_it_is(lif) -> None:
     assert dict(lif.sizes) == {"drive": 5, "neuron.tau_m": 3, "seed": 3}
     assert lif["rate"].attrs["units"] == "Hz"
     assert lif["neuron.tau_m"].attrs["units"] == "ms"
-    assert (lif["status"] == folder.OK).all()
+    assert (lif["status"] == definition.OK).all()
     config, made = json.loads(lif.attrs["config"]), json.loads(lif.attrs["provenance"])
     assert config["study"] == "lif" and config["options"]["steps"] == 60
     assert {"jax", "numpy", "python"} <= set(made["versions"])
@@ -136,8 +136,8 @@ def test_other_settings_are_refused(tmp_path) -> None:
 def test_trials_that_break_are_recorded(tmp_path) -> None:
     data = run(TOY, tmp_path, options=("bad=2.0",))
     status = data["status"]
-    assert (status.sel(a=2.0) == folder.NON_FINITE).all()
-    assert (status.sel(a=[1.0, 3.0, 4.0]) == folder.OK).all()
+    assert (status.sel(a=2.0) == definition.NON_FINITE).all()
+    assert (status.sel(a=[1.0, 3.0, 4.0]) == definition.OK).all()
     # An optional metric may be NaN in a good trial.
     assert np.isnan(data["positive"].sel(a=[1.0, 3.0, 4.0])).any()
 
@@ -151,7 +151,7 @@ def test_a_chunk_that_raises_is_recorded_and_run_again(tmp_path) -> None:
     assert result["complete"] and result["failed"] == 6 and result["trials"] == 24
     assert result["missing"] == 0
     data = load(out)
-    assert (data["status"].sel(a=3.0) == folder.FAILED).all()
+    assert (data["status"].sel(a=3.0) == definition.FAILED).all()
     assert np.isnan(data["value"].sel(a=3.0)).all()
     assert "a is three" in json.loads(data.attrs["failures"])["4/0"]
     assert sweep.main(config)["failed"] == 6  # recorded: not tried again by itself
@@ -190,7 +190,7 @@ def test_halving_keeps_the_numbers_of_survivors(tmp_path) -> None:
     halved = run(TOY, tmp_path / "halved", halving=(1, 2), keep=0.5)
     budget = halved["budget"].values.reshape(8, 3)
     assert [int((budget[:, 0] == b).sum()) for b in (1, 2)] == [4, 2]
-    last = halved["status"] == folder.OK
+    last = halved["status"] == definition.OK
     assert int(last.sum()) == 2 * 3
     np.testing.assert_array_equal(
         halved["value"].values[last.values], whole["value"].values[last.values]
@@ -198,7 +198,7 @@ def test_halving_keeps_the_numbers_of_survivors(tmp_path) -> None:
     assert np.isnan(halved["value"].values[~last.values]).all()
     # Who went on follows from the scores of the rung below.
     held = held_sweep(tmp_path / "halved")
-    found = Reader(held.out).found(held, folder.segments_of(folder.read_plan(held.out)), 8, 1)
+    found = Reader(held.out).found(held, plan.segments_of(plan.read_plan(held.out)), 8, 1)
     scores = rungs.setting_scores(found.metrics["value"], found.status, "max", 0.75)
     kept = np.flatnonzero(budget[:, 0] >= 2)
     assert set(kept) == set(np.argsort(-scores, kind="stable")[:4])
@@ -278,6 +278,6 @@ def test_gather_of_an_empty_folder_is_all_missing(tmp_path) -> None:
     rungs.grow(made)
     held = held_sweep(tmp_path, load=True)
     data = gather.gather(held)
-    assert (data["status"] == folder.MISSING).all() and not data.attrs["complete"]
+    assert (data["status"] == definition.MISSING).all() and not data.attrs["complete"]
     assert done_chunks(tmp_path) == set()
     assert not run_shard(held, shard=0, shards=24, exclusive=True).complete

@@ -13,7 +13,7 @@ import pytest
 import xarray as xr
 
 from snn_fusion_failure.commands import sweep
-from snn_fusion_failure.sweeps import folder, rungs
+from snn_fusion_failure.sweeps import definition, plan, rungs
 from snn_fusion_failure.sweeps.program import compile_study
 from snn_fusion_failure.sweeps.study import load_study
 from tests.snn_fusion_failure.sweep_toy import load, same
@@ -70,7 +70,7 @@ def test_an_adaptive_design_finds_the_valley_and_goes_on_after_a_loss(
     # Lose the last round: the same settings are asked for again, to the bit.
     parts = sorted((tmp_path / "a" / "plan").iterdir())
     parts[-1].unlink()
-    segment = len(folder.segments_of(folder.read_plan(tmp_path / "a")))
+    segment = len(plan.segments_of(plan.read_plan(tmp_path / "a")))
     for path in (tmp_path / "a" / "chunks").glob(f"{segment:05d}-*"):
         path.unlink()
     same(run(valley, tmp_path / "a", **{kind: AXES}), data, "x", "y", "height")
@@ -103,7 +103,7 @@ def test_what_a_sampler_cannot_do_is_refused(valley, tmp_path, changes, message)
 def test_a_survivor_that_is_gone_on_with_has_the_numbers_of_a_whole_trial(tmp_path, mode) -> None:
     whole = run(LIF, tmp_path / "whole")
     cut = run(LIF, tmp_path / "cut", **{mode: (15, 30)})
-    last = (cut["status"] == folder.OK).values
+    last = (cut["status"] == definition.OK).values
     assert 2 * 2 <= last.sum() < last.size
     for name in ("rate", "error"):
         np.testing.assert_array_equal(cut[name].values[last], whole[name].values[last])
@@ -116,7 +116,7 @@ def test_a_survivor_that_is_gone_on_with_has_the_numbers_of_a_whole_trial(tmp_pa
 
 def test_asha_promotes_before_a_rung_is_full(tmp_path) -> None:
     run(LIF, tmp_path, asha=(15, 30), keep=0.5)
-    budgets = [s.budget for s in folder.segments_of(folder.read_plan(tmp_path))]
+    budgets = [s.budget for s in plan.segments_of(plan.read_plan(tmp_path))]
     assert budgets.index(30) < len(budgets) - 1 - budgets[::-1].index(15)
 
 

@@ -19,7 +19,7 @@ import xarray as xr
 
 from snn_fusion_failure.commands import sweep
 from snn_fusion_failure.runs import files
-from snn_fusion_failure.sweeps import chunks, folder, leases, worker
+from snn_fusion_failure.sweeps import chunks, definition, leases, plan, worker
 from snn_fusion_failure.sweeps.chunkfile import DamagedError, load_chunk
 from snn_fusion_failure.sweeps.engine import collect
 from snn_fusion_failure.sweeps.folder import chunk_path, done_chunks, held_sweep
@@ -65,7 +65,7 @@ def test_a_rung_that_failed_is_derived_again(tmp_path, capsys) -> None:
     )
     opened = sweep.open_sweep(config)
     rung = worker.Worker(opened)
-    first = folder.segments_of(folder.read_plan(out))[0]
+    first = plan.segments_of(plan.read_plan(out))[0]
     for number in range(first.n_chunks(opened)):
         rung.run(first, number)
     flag.touch()  # from the second rung on a == 3 raises
@@ -78,7 +78,7 @@ def test_a_rung_that_failed_is_derived_again(tmp_path, capsys) -> None:
     straight = dataclasses.replace(config, out=tmp_path / "straight")
     sweep.main(straight)
     data, wanted = load(out), load(tmp_path / "straight")
-    ended = (wanted["status"] == folder.OK).values
+    ended = (wanted["status"] == definition.OK).values
     assert ended.sum() == 6
     np.testing.assert_array_equal(data["value"].values[ended], wanted["value"].values[ended])
 
@@ -129,7 +129,7 @@ def load_after(config: sweep.Config, **changes: Any) -> xr.Dataset:
 def test_a_setting_of_which_most_trials_broke_is_not_ranked() -> None:
     """Six of eight trials of the first setting broke; its two lucky ones are the best of all."""
     values = np.array([[9.0] * 2 + [np.nan] * 6, [1.0] * 8, [2.0] * 7 + [np.nan]])
-    status = np.where(np.isfinite(values), folder.OK, folder.NON_FINITE)
+    status = np.where(np.isfinite(values), definition.OK, definition.NON_FINITE)
     data = xr.Dataset(
         {"value": (("a", "seed"), values, {"goal": "max", "units": "1"}),
          "status": (("a", "seed"), status)},
@@ -145,7 +145,7 @@ def test_a_setting_of_which_most_trials_broke_is_not_ranked() -> None:
     scores = setting_scores(values, status, "max", 0.75)
     assert scores.tolist() == [-np.inf, 1.0, 2.0]
     # A status that is not ok does not count, whatever the number is.
-    status[2, :3] = folder.FAILED
+    status[2, :3] = definition.FAILED
     assert setting_scores(values, status, "max", 0.75)[2] == -np.inf
 
 
@@ -369,7 +369,7 @@ def test_a_raising_setting_fails_alone(whole, tmp_path) -> None:
     flag.touch()
     changes = {"options": (f"broken_while={flag}",), "chunk_trials": 24}
     data = run(tmp_path / "out", **changes)
-    assert (data["status"].sel(a=3.0) == folder.FAILED).all()
+    assert (data["status"].sel(a=3.0) == definition.FAILED).all()
     healthy = [1.0, 2.0, 4.0]
     same(data.sel(a=healthy), whole.sel(a=healthy), *VARIABLES)
     flag.unlink()
@@ -406,7 +406,7 @@ def test_memory_that_runs_out_halves_the_chunk_size(whole, tmp_path, monkeypatch
     monkeypatch.setattr(worker, "compile_study", small_memory)
     data = run(tmp_path, chunk_size="6")
     assert tried[:3] == [6, 3, 2]
-    assert (data["status"] == folder.OK).all()
+    assert (data["status"] == definition.OK).all()
     assert "memory ran out; chunk size 2 from here on" in data.attrs["notes"]
     np.testing.assert_allclose(data["value"], whole["value"], rtol=1e-6)
 

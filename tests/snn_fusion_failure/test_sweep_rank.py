@@ -7,7 +7,7 @@ import pytest
 import xarray as xr
 from scipy import stats
 
-from snn_fusion_failure.sweeps import folder
+from snn_fusion_failure.sweeps import definition
 from snn_fusion_failure.sweeps.rank import compare, pareto, rank
 from snn_fusion_failure.sweeps.results import setting_scores
 from snn_fusion_failure.sweeps.rungs import promotions, survivors
@@ -30,7 +30,10 @@ def dataset(values, status=None, *, goal="max", cost=None, common=False) -> xr.D
 
 def test_a_number_of_a_trial_that_is_not_ok_does_not_count() -> None:
     """A failed trial may have left a finite number; the status decides."""
-    status = [[folder.OK, folder.OK, folder.FAILED], [folder.OK, folder.NON_FINITE, folder.OK]]
+    status = [
+        [definition.OK, definition.OK, definition.FAILED],
+        [definition.OK, definition.NON_FINITE, definition.OK],
+    ]
     rows = rank(dataset([[1.0, 3.0, 100.0], [4.0, np.nan, 6.0]], status))
     assert [(r["setting"], r["mean"], r["n"], r["broken"]) for r in rows] == [
         (1, 5.0, 2, 1), (0, 2.0, 2, 1),
@@ -44,11 +47,13 @@ def test_smaller_is_better_where_the_metric_says_so() -> None:
 
 def test_a_score_is_the_mean_of_the_valid_seeds_or_none_at_all() -> None:
     values = np.array([[2.0, 4.0, np.nan, np.nan], [1.0, np.nan, np.nan, np.nan]])
-    status = np.where(np.isfinite(values), folder.OK, folder.NON_FINITE)
+    status = np.where(np.isfinite(values), definition.OK, definition.NON_FINITE)
     assert setting_scores(values, status, "max", 0.5).tolist() == [3.0, -np.inf]
     assert setting_scores(values, status, "min", 0.25).tolist() == [-3.0, -1.0]
     empty = np.full((1, 2), np.nan)
-    assert setting_scores(empty, np.full((1, 2), folder.FAILED), "max", 0.0).tolist() == [-np.inf]
+    assert setting_scores(empty, np.full((1, 2), definition.FAILED), "max", 0.0).tolist() == [
+        -np.inf
+    ]
 
 
 def test_the_front_keeps_what_is_as_good_in_one_and_better_in_another() -> None:
@@ -59,7 +64,7 @@ def test_the_front_keeps_what_is_as_good_in_one_and_better_in_another() -> None:
 
 def test_paired_seeds_are_those_that_are_valid_in_both() -> None:
     status = np.zeros((2, 5), int)
-    status[0, 4] = status[1, 3] = folder.FAILED
+    status[0, 4] = status[1, 3] = definition.FAILED
     a, b = np.array([5.0, 7.0, 9.0, 100.0, 100.0]), np.array([4.0, 5.0, 6.5, -100.0, -100.0])
     found = compare(dataset([a, b], status, common=True), 0, 1)
     wanted = stats.ttest_rel(a[:3], b[:3])
@@ -73,7 +78,7 @@ def test_independent_seeds_are_compared_without_equal_variances() -> None:
     a, b = rng.normal(0.0, 5.0, 6), rng.normal(1.0, 0.1, 6)
     a[5] = 1e6  # of a trial that failed
     status = np.zeros((2, 6), int)
-    status[0, 5] = folder.FAILED
+    status[0, 5] = definition.FAILED
     found = compare(dataset([a, b], status), 0, 1)
     test = stats.ttest_ind(a[:5], b, equal_var=False)
     interval = test.confidence_interval(0.95)

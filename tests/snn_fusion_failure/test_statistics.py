@@ -79,3 +79,10 @@ def test_the_interval_over_seeds_and_subjects_is_wider_than_over_seeds() -> None
     low, high = two_way_interval(table)
     assert low < table.mean() < high
     assert high - low > 5.0 * np.ptp(table.mean(axis=1))
+
+
+def test_groups_that_are_redrawn_whole_count_by_their_size() -> None:
+    """One 0 and nine 1: half of the draws hold both groups, whose mean is 0.9 and not 0.5."""
+    values, groups = [0.0, *[1.0] * 9], [0, *[1] * 9]
+    found = bootstrap_interval(values, groups, level=0.4)
+    assert (found.low, found.high, found.n) == (0.9, 0.9, 2)

@@ -67,8 +67,8 @@ def make(
         u = jnp.zeros((n_total, dim)).at[:n_init].set(sample(cube, n_init, key=key))
         y = jnp.full((n_total,), jnp.nan).at[:n_init].set(simulate(scale * u[:n_init]))
 
-        def step(carry: Any, n: Any) -> Any:
-            u, y, fitted = carry
+        def step(carry: Any) -> Any:
+            n, u, y, fitted = carry
             used = (jnp.arange(n_total) < n).astype(u.dtype)
             raw = filled(y, n)
             z, _, _ = gp.standardize(raw, used)
@@ -90,10 +90,16 @@ def make(
             mean, variance = gp.predict(config, posterior, points)
             value = acquisition.weighted(mean, jnp.sqrt(variance), jnp.asarray(params.weight))
             point = points[jnp.argmax(value)]
-            return (u.at[n].set(point), y.at[n].set(simulate(scale * point[None])[0]), fitted), None
+            y = y.at[n].set(simulate(scale * point[None])[0])
+            return n + 1, u.at[n].set(point), y, fitted
 
         start = (u, y, gp_fit.initial_params(config, dim)) if carry is None else carry
-        carry, _ = jax.lax.scan(step, start, jnp.arange(max(begin, n_init), max(end, n_init)))
+        # Hidden from the compiler: a loop whose length it knows may be compiled differently, and a
+        # search in parts would not be the search in one go.
+        bounds = jnp.asarray([max(begin, n_init), max(end, n_init)], jnp.int32)
+        bounds = jax.lax.optimization_barrier(bounds)
+        _, *rest = jax.lax.while_loop(lambda c: c[0] < bounds[1], step, (bounds[0], *start))
+        carry = tuple(rest)
         y = carry[1]
         done = jnp.arange(n_total) < end
         valid = jnp.isfinite(y) & done

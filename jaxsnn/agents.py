@@ -15,9 +15,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 from jaxsnn import network
 from jaxsnn.config import NetworkConfig, NetworkParams, check_network
-from jaxsnn.encoding import group_rates, poisson_spikes
+from jaxsnn.encoding import RateTable, group_rates, interval_rates, poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
 from jaxsnn.rewards import motor_rewards, scale_by_remaining_turn, terminal_reward
+from jaxsnn.turn_goal import turn_reward
 from jaxsnn.window import STDPKernel
 from jaxsnn.world import Outcome, Reading
 
@@ -45,6 +46,10 @@ class Agent(NamedTuple):
     info: tuple[str, ...] = ()
 
 
+RewardFunction = Callable[[NetworkParams, Reading, Array, Array], Array]
+"""`(params, reading, recent_turn, turn) -> [2]`; see `snn_agent`."""
+
+
 class SNNParams(NamedTuple):
     """`NetworkParams` and what is worked out from them once; made by `snn_params`."""
 
@@ -53,10 +58,11 @@ class SNNParams(NamedTuple):
 
 
 class SNNMemory(NamedTuple):
-    """Eligibility of the last window and the reading that the network acted on."""
+    """Eligibility of the last window, the reading that the network acted on, the turns before."""
 
     eligibility: Eligibility | None
     reading: Reading
+    recent_turn: Array
 
 
 def snn_params(config: NetworkConfig, params: NetworkParams) -> SNNParams:
@@ -72,19 +78,50 @@ def snn_params(config: NetworkConfig, params: NetworkParams) -> SNNParams:
 def steering_angle(params: NetworkParams, rates: Float[Array, "2"]) -> Float[Array, ""]:
     r"""Turn of the robot from the firing rates of the motors [deg], positive to the left.
 
-    .. math:: \theta = g\,(freq_r - freq_l)
+    .. math:: \theta = g\,(b_r\, freq_r - b_l\, freq_l)
 
     Args:
-        params: NetworkParams; `steering_gain` is `g` [deg/Hz], 1 in the source.
+        params: NetworkParams; `steering_gain` is `g` [deg/Hz], `right_motor` and `left_motor` are
+            `b_r` and `b_l`, all 1 in the source.
         rates: of the left and the right motor neuron [Hz].
 
     Source: Shim (2020), section 2.4.3. The sign is that of our world: the source writes
         `freq_l - freq_r` and steers left when that is negative.
     """
-    return params.steering_gain * (rates[1] - rates[0])
+    left, right = params.left_motor * rates[0], params.right_motor * rates[1]
+    return params.steering_gain * (right - left)
 
 
-def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
+def input_rates(
+    config: NetworkConfig,
+    params: NetworkParams,
+    reading: Reading,
+    recent_turn: Float[Array, ""],
+    *,
+    table: RateTable | None = None,
+) -> Float[Array, " n_in"]:
+    """Firing rate of each input neuron for a reading [Hz].
+
+    Args:
+        config: NetworkConfig.
+        params: NetworkParams.
+        reading: of the sensors.
+        recent_turn: leaky mean of the last turns [deg], for `config.turn_groups`.
+        table: `config.rates`, worked out once.
+    """
+    if config.input_code == "interval":
+        rates = interval_rates(params.interval_rate, *reading)
+    else:
+        rates = group_rates(config.rates if table is None else table, *reading)
+    if config.turn_groups:
+        both = jnp.clip(jnp.stack([recent_turn, -recent_turn]) / 60.0, 0.0, 1.0)
+        rates = jnp.concatenate([rates, (params.turn_rate * both).astype(rates.dtype)])
+    return jnp.repeat(rates, config.group_exc + config.group_inh)
+
+
+def snn_agent(
+    config: NetworkConfig, *, plastic: bool = True, reward: RewardFunction | None = None
+) -> Agent:
     """The network as an agent.
 
     In a control step the inputs fire at the rates of the reading for `config.control_steps`, in
@@ -95,6 +132,10 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
     Args:
         config: NetworkConfig.
         plastic: False for frozen weights: nothing is learnt, and traces are not computed.
+        reward: a function of one's own in place of the rewards on the way,
+            `(params, reading, recent_turn, turn) -> [left, right]`: NetworkParams, what the network
+            saw, the leaky mean of the turns before [deg], and the turn that the motors ask for
+            [deg, positive to the left]. Collision and arrival keep theirs.
 
     Returns:
         Agent whose parameters are `SNNParams` and whose state is `NetworkState`.
@@ -102,12 +143,21 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
     n_windows = config.control_steps // config.hold_steps
     table = config.rates
 
-    def reward_of(constants: NetworkParams, reading: Reading, window: Eligibility) -> Array:
+    def reward_of(
+        constants: NetworkParams, reading: Reading, window: Eligibility, recent_turn: Array
+    ) -> Array:
         turn = steering_angle(constants, window.output_count / window.duration)
-        reward = motor_rewards(
+        if reward is not None:
+            return reward(constants, reading, recent_turn, turn)
+        if config.guidance == "graded":
+            return turn_reward(constants.goal, reading, recent_turn, turn)
+        rewards = motor_rewards(
             constants.reward, reading.sonar, reading.distance, reading.angle, turn
         )
-        return scale_by_remaining_turn(constants.reward, reward, turn)
+        return scale_by_remaining_turn(constants.reward, rewards, turn)
+
+    def learning_share(constants: NetworkParams, state: NetworkState) -> Array:
+        return (1.0 / (1.0 + state.updates / constants.anneal)).astype(state.hidden.v.dtype)
 
     def init(key: Key[Array, ""], params: SNNParams) -> NetworkState:
         return network.init(key, config, params.network)
@@ -122,8 +172,8 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         key: Key[Array, ""],
     ) -> tuple[NetworkState, Float[Array, ""], SNNMemory, Float[Array, "3"]]:
         constants = params.network
-        by_group = group_rates(table, reading.sonar, reading.distance, reading.angle)
-        rates = jnp.repeat(by_group, config.group_exc + config.group_inh)
+        recent_turn = jnp.where(fresh, 0.0, state.recent_turn)
+        rates = input_rates(config, constants, reading, recent_turn, table=table)
         state = network.reset_membranes(constants, state, fresh)
         baselines = state.baseline_input, state.baseline_hidden
 
@@ -144,7 +194,7 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
 
         dtype = state.hidden.v.dtype
         keep = 1.0 - fresh.astype(dtype)
-        learning = active.astype(dtype)
+        learning = active.astype(dtype) * learning_share(constants, state)
         total = jnp.zeros((3,), dtype)
         if n_windows > 1:
 
@@ -155,7 +205,7 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
                 if plastic:
                     weights = network.reinforce(
                         config, constants, state.weights, eligibility,
-                        reward_of(constants, reading, eligibility), learning,
+                        reward_of(constants, reading, eligibility, recent_turn), learning,
                     )  # fmt: skip
                     state = state._replace(weights=weights)
                 return (state, total + count(spikes)), None
@@ -168,8 +218,12 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         mine = jax.tree.map(lambda new, old: jnp.where(active, new, old), mine, baselines)
         state = state._replace(baseline_input=mine[0], baseline_hidden=mine[1])
         firing = (total + count(spikes)) / (config.control_steps * config.dt)
-        steering = steering_angle(constants, firing[:2])
-        return state, steering, SNNMemory(eligibility, reading), firing
+        limit = constants.max_turn
+        steering = jnp.clip(steering_angle(constants, firing[:2]), -limit, limit)
+        kept = constants.goal.memory
+        turned = kept * recent_turn + (1.0 - kept) * jnp.clip(steering, -60.0, 60.0)
+        state = state._replace(recent_turn=turned.astype(state.recent_turn.dtype))
+        return state, steering, SNNMemory(eligibility, reading, recent_turn), firing
 
     def learn(
         params: SNNParams,
@@ -185,14 +239,15 @@ def snn_agent(config: NetworkConfig, *, plastic: bool = True) -> Agent:
         observed = memory.reading
         if config.reward_timing == "after" and next_reading is not None:
             observed = next_reading
-        reward = reward_of(constants, observed, memory.eligibility)
+        given = reward_of(constants, observed, memory.eligibility, memory.recent_turn)
         end = terminal_reward(constants.reward, outcome.collided, outcome.arrived)
-        reward = jnp.where(outcome.collided | outcome.arrived, end, reward)
-        learning = active.astype(state.weights.hidden.dtype)
+        given = jnp.where(outcome.collided | outcome.arrived, end, given)
+        going = active.astype(state.weights.hidden.dtype)
+        learning = going * learning_share(constants, state)
         weights = network.reinforce(
-            config, constants, state.weights, memory.eligibility, reward, learning
+            config, constants, state.weights, memory.eligibility, given, learning
         )
-        return state._replace(weights=weights)
+        return state._replace(weights=weights, updates=state.updates + going)
 
     def finite(state: NetworkState) -> Bool[Array, ""]:
         # A weight that is not a number makes the potential of its neuron one that is not.

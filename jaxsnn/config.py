@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, Literal, NamedTuple
 
 import jax.numpy as jnp
@@ -18,10 +19,11 @@ from jaxsnn._checks import (
     require_positive,
     require_whole,
 )
-from jaxsnn.encoding import N_GROUPS, AngleCode, RateTable, rate_table
+from jaxsnn.encoding import GROUPS, AngleCode, InputCode, RateTable, rate_table
 from jaxsnn.neurons import LIFParams, check_lif
 from jaxsnn.plasticity import Bounds, Rule, STDPParams, check_stdp
 from jaxsnn.rewards import RewardParams, check_rewards, reward_params
+from jaxsnn.turn_goal import TurnGoalParams, check_turn_goal
 
 
 @dataclasses.dataclass(frozen=True)
@@ -44,6 +46,12 @@ class NetworkConfig:
         angle_code: order of the rates of the angle's intervals, see `encoding.ANGLE_CODES`.
         reward_timing: the reward of a control step comes from the reading that the network saw
             ("before") or from the one after the move ("after").
+        input_code: one input group for each "sensor", whose rate says the interval (the source), or
+            one for each "interval" (`encoding.interval_rates`).
+        turn_groups: two more input groups fire in proportion to the robot's recent turns to the
+            left and to the right: what a network without recurrence has of memory.
+        guidance: rewards on the way by the "nearest" obstacle (the source) or "graded" from all
+            sonars (`turn_goal.turn_reward`).
     """
 
     rule: Rule = "multiplicative"
@@ -59,6 +67,9 @@ class NetworkConfig:
     w_max_split: Literal["post", "pre"] = "post"
     angle_code: AngleCode = "region"
     reward_timing: Literal["before", "after"] = "before"
+    input_code: InputCode = "sensor"
+    turn_groups: bool = False
+    guidance: Literal["nearest", "graded"] = "nearest"
 
     def __post_init__(self) -> None:
         """Refuse sizes and choices that make no network."""
@@ -87,15 +98,23 @@ class NetworkConfig:
             "bounds": ("hard", "soft"),
             "w_max_split": ("post", "pre"),
             "reward_timing": ("before", "after"),
+            "input_code": tuple(GROUPS),
+            "turn_groups": (False, True),
+            "guidance": ("nearest", "graded"),
         }
         for name, allowed in choices.items():
             require_choice(name, getattr(self, name), allowed)
         rate_table(self.encoding, self.angle_code)
 
     @property
+    def n_groups(self) -> int:
+        """Input groups."""
+        return GROUPS[self.input_code] + 2 * self.turn_groups
+
+    @property
     def n_in(self) -> int:
         """Input neurons."""
-        return N_GROUPS * (self.group_exc + self.group_inh)
+        return self.n_groups * (self.group_exc + self.group_inh)
 
     @property
     def n_hidden(self) -> int:
@@ -136,15 +155,22 @@ class NetworkParams(NamedTuple):
         init_low: initial weights are uniform between this fraction of their bound and the bound.
         gain_input, gain_output: what a weight is multiplied with to give the jump of the potential.
         steering_gain: degrees per Hz of difference between the motors; 1 is the source.
+        left_motor, right_motor: what each motor makes of its rate; below 1 it is weak.
         homeostasis: rate of synaptic scaling [1/s]; 0 is the source. While a neuron fires above
             its target rate, its excitatory inputs shrink and its inhibitory ones grow, and the
             other way round below it. Without it, what has grown fires more and grows faster.
         homeostasis_output: rate of the scaling of the second layer relative to `homeostasis`. It is
             what keeps one motor from winning for good.
-        rate_hidden, rate_output: target rates of the scaling [Hz].
         centring: share of a presynaptic neuron's mean firing that is taken off before the trace is
             formed; 0 is the source, 1 makes the trace a covariance (see `running_mean`).
         tau_baseline: time constant of that mean [s].
+        rate_hidden, rate_output: target rates of the scaling [Hz].
+        max_turn: the robot turns by no more than this in a step [deg]; infinite in the source.
+        anneal: control steps after which the learning rate is half, `1 / (1 + n / anneal)`;
+            infinite in the source.
+        interval_rate: of the group that is on, with one group for each interval [Hz].
+        turn_rate: of a turn group after turns of 60 degrees [Hz].
+        goal: constants of the graded reward.
     """
 
     hidden: LIFParams = LIFParams()
@@ -160,12 +186,19 @@ class NetworkParams(NamedTuple):
     gain_input: float | Array = 1.0
     gain_output: float | Array = 1.0
     steering_gain: float | Array = 1.0
+    left_motor: float | Array = 1.0
+    right_motor: float | Array = 1.0
     homeostasis: float | Array = 0.0
     homeostasis_output: float | Array = 1.0
     centring: float | Array = 0.0
     tau_baseline: float | Array = 20.0
     rate_hidden: float | Array = 25.0
     rate_output: float | Array = 60.0
+    max_turn: float | Array = math.inf
+    anneal: float | Array = math.inf
+    interval_rate: float | Array = 150.0
+    turn_rate: float | Array = 100.0
+    goal: TurnGoalParams = TurnGoalParams()
 
 
 class Weights(NamedTuple):
@@ -201,9 +234,20 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
     check_lif(params.output, dt=config.dt)
     check_stdp(params.stdp, dt=config.dt)
     check_rewards(params.reward)
+    check_turn_goal(params.goal)
+    for name in ("max_turn", "anneal"):
+        value = concrete(getattr(params, name))
+        good = value is None or bool((value > 0).all())
+        require(good, f"{name}={value}: expected a number > 0; infinity leaves it out")
+    for name in ("interval_rate", "turn_rate"):
+        value = concrete(getattr(params, name))
+        require_positive(name, getattr(params, name), "give a firing rate in Hz", zero=True)
+        require(
+            value is None or bool((value * config.dt <= 1.0).all()),
+            f"{name}={value}: expected at most one spike per step, {1 / config.dt:g} Hz; lower it",
+        )
     require_positive("tau_baseline", params.tau_baseline, "give it in seconds")
-    positive = ("w_max", "w_max_low", "gain_input", "gain_output", "rate_hidden", "rate_output")
-    for name in positive:
+    for name in ("w_max", "w_max_low", "gain_input", "gain_output", "rate_hidden", "rate_output"):
         require_positive(name, getattr(params, name), "give it in mV (rates: Hz)")
     for name in (
         "gamma",
@@ -213,6 +257,8 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
         "homeostasis",
         "homeostasis_output",
         "centring",
+        "left_motor",
+        "right_motor",
     ):
         require_positive(name, getattr(params, name), "give a number >= 0", zero=True)
     require_finite("steering_gain", params.steering_gain, "give degrees per Hz")
@@ -236,7 +282,7 @@ def neuron_signs(config: NetworkConfig) -> tuple[np.ndarray, np.ndarray]:
     """+1 for excitatory, -1 for inhibitory: input neurons `[n_in]`, hidden neurons `[n_hidden]`."""
     group = np.repeat([1.0, -1.0], [config.group_exc, config.group_inh])
     half = np.repeat([1.0, -1.0], [config.hidden_exc // 2, config.hidden_inh // 2])
-    return np.tile(group, N_GROUPS).astype(np.float32), np.tile(half, 2).astype(np.float32)
+    return np.tile(group, config.n_groups).astype(np.float32), np.tile(half, 2).astype(np.float32)
 
 
 def weight_bounds(config: NetworkConfig, params: NetworkParams) -> Weights:

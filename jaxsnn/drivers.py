@@ -26,11 +26,13 @@ class DriverParams(NamedTuple):
         distance: a sonar below this sets the reflex off [px]; 0 is the blind driver.
         turn: size of the reflex's turn [deg].
         limit: largest turn towards the target [deg].
+        left: factor on turns to the left; below 1 the right motor is weak.
     """
 
     distance: float | Array = 60.0
     turn: float | Array = 40.0
     limit: float | Array = 30.0
+    left: float | Array = 1.0
 
 
 DRIVERS = {
@@ -53,7 +55,8 @@ def driver_steering(params: DriverParams, reading: world.Reading) -> Float[Array
     left, right = jnp.min(reading.sonar[:half]), jnp.min(reading.sonar[half + 1 :])
     away = jnp.where(left < right, -params.turn, params.turn)
     ahead = jnp.clip(reading.angle, -params.limit, params.limit)
-    return jnp.where(jnp.min(reading.sonar) < params.distance, away, ahead)
+    turn = jnp.where(jnp.min(reading.sonar) < params.distance, away, ahead)
+    return jnp.where(turn > 0, params.left * turn, turn)
 
 
 def driver_agent() -> Agent:

@@ -20,9 +20,22 @@ from jaxsnn._checks import (
     require_positive,
     require_whole,
 )
-from jaxsnn.sensor_intervals import angle_region, distance_interval, sonar_interval
+from jaxsnn.sensor_intervals import (
+    N_DISTANCE,
+    N_NEAR,
+    N_OCTANT,
+    angle_octant,
+    angle_region,
+    distance_interval,
+    near_interval,
+    sonar_interval,
+)
 
-N_GROUPS = 7
+N_SONARS = 5
+GROUPS = {"sensor": N_SONARS + 2, "interval": N_SONARS * N_NEAR + N_DISTANCE + N_OCTANT}
+"""Input groups of the two codes: one for each sensor, or one for each interval of each sensor."""
+
+InputCode = Literal["sensor", "interval"]
 
 AngleCode = Literal["region", "listed", "ring"]
 
@@ -120,6 +133,36 @@ def group_rates(
             table.angle[angle_region(angle)][None],
         ]
     )
+
+
+def interval_rates(
+    rate: float | Float[Array, ""],
+    sonar: Float[Array, "5"],
+    distance: Float[Array, ""],
+    angle: Float[Array, ""],
+) -> Float[Array, "32"]:
+    """Firing rates of one group for each interval: `rate` where the reading lies, 0 elsewhere.
+
+    A synapse can then speak for one interval of one sensor, where with one rate for each sensor it
+    multiplies all of them.
+
+    Args:
+        rate: of the group that is on [Hz].
+        sonar: ultrasonic readings [px], left to right.
+        distance: to the target [px].
+        angle: from the heading to the target [deg], positive to the left.
+
+    Returns:
+        Rates [Hz]: four intervals of each sonar, four of the distance, eight of the angle.
+
+    Source: ours.
+    """
+    on = [
+        jax.nn.one_hot(near_interval(sonar), N_NEAR, dtype=sonar.dtype).reshape(-1),
+        jax.nn.one_hot(distance_interval(distance), N_DISTANCE, dtype=sonar.dtype),
+        jax.nn.one_hot(angle_octant(angle), N_OCTANT, dtype=sonar.dtype),
+    ]
+    return rate * jnp.concatenate(on)
 
 
 def poisson_spikes(

@@ -15,9 +15,10 @@ import numpy as np
 from jaxtyping import Array, Int, Key
 
 from jaxsnn import network, planner, world
-from jaxsnn._checks import require_keys, require_whole
-from jaxsnn.agents import SNNParams, snn_agent, snn_params
+from jaxsnn._checks import require, require_keys, require_whole
+from jaxsnn.agents import Agent, RewardFunction, snn_agent, snn_params
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights
+from jaxsnn.network import NetworkState
 from jaxsnn.trials import TrialResult, check_circles, run_phase, start_states
 
 TEST_TRIALS = {1: 30, 2: 20, 3: 20}
@@ -51,7 +52,7 @@ class Experiment(NamedTuple):
 
 def run_experiment(
     config: NetworkConfig,
-    params: SNNParams,
+    params: Any,
     map: world.WorldParams,
     *,
     keys: Key[Array, " robots"],
@@ -62,17 +63,20 @@ def run_experiment(
     block: int = 8,
     circles: Int[Array, " trials"] | None = None,
     weights: Weights | None = None,
+    states: NetworkState | None = None,
     params_axis: Any = None,
     map_axis: Any = None,
     test_map: world.WorldParams | None = None,
     record: bool = False,
     keep_states: bool = False,
+    reward: RewardFunction | None = None,
+    agents: tuple[Agent, Agent] | None = None,
 ) -> Experiment:
     """Robots learn, then are tested: both phases of all robots in one program.
 
     Args:
         config: NetworkConfig.
-        params: SNNParams.
+        params: SNNParams, or what `agents` take.
         map: the map to learn on.
         keys: one per robot (an independent run each).
         n_learn, n_test: trials of the two phases; weights are frozen in testing.
@@ -81,11 +85,16 @@ def run_experiment(
         block: robots that run together; see the module's docstring.
         circles: start circle of each learning trial; drawn at random when not given.
         weights: first weights, leaves `[robots, ...]`; drawn at random when not given.
+        states: networks to go on with, leaves `[robots, ...]`, from `saved.load_networks` or an
+            earlier experiment; instead of `weights`.
         params_axis, map_axis: 0 when each robot has its own, a tree for some leaves only, as in
             `jax.vmap`.
         test_map: the map to test on; `map` when not given. Shares `map_axis`.
         record: keep the poses.
         keep_states: return the networks after learning (0.4 MB per robot).
+        reward: a function of one's own in place of the rewards on the way, see `agents.snn_agent`.
+        agents: learner and tester of one's own, instead of the network of `config`; they share
+            the state that the learner's `init` makes, and `params` are theirs.
 
     Returns:
         Experiment; leaves lead with robots.
@@ -99,15 +108,26 @@ def run_experiment(
     require_whole("n_online", n_online, 0, "give 0 for none")
     check_circles(map, circles, n_learn)
     robots = keys.shape[0]
-    learner, frozen = snn_agent(config), snn_agent(config, plastic=False)
+    require(
+        agents is None or (reward is None and weights is None),
+        "agents, reward, weights: expected no reward and no weights beside agents; they have both",
+    )
+    learner, frozen = agents or (snn_agent(config, reward=reward), snn_agent(config, plastic=False))
+    require(
+        weights is None or states is None,
+        "weights, states: expected one of them; the states hold weights",
+    )
     if weights is not None:
         network.check_weights(config, params.network, weights, robots)
+    if states is not None and agents is None:
+        network.check_weights(config, params.network, states.weights, robots)
 
     def run(
-        robot_keys: Array, weights: Any, params: SNNParams, map: Any, test_map: Any
+        robot_keys: Array, weights: Any, states: Any, params: Any, map: Any, test_map: Any
     ) -> Experiment:
         split = jax.vmap(phase_keys)(robot_keys)
-        states = jax.vmap(learner.init, in_axes=(0, params_axis))(split[:, 0], params)
+        if states is None:
+            states = jax.vmap(learner.init, in_axes=(0, params_axis))(split[:, 0], params)
         if weights is not None:
             states = states._replace(weights=weights)
         axes = {"params_axis": params_axis, "map_axis": map_axis, "max_steps": max_steps}
@@ -131,9 +151,9 @@ def run_experiment(
     n_blocks = -(-robots // block)
     # The last block is filled up with robots from the front, which are dropped again.
     order = jnp.arange(n_blocks * block) % robots
-    trees = (keys, weights, params, map, map if test_map is None else test_map)
+    trees = (keys, weights, states, params, map, map if test_map is None else test_map)
     leaves, form = jax.tree.flatten(trees)
-    own = _mapped((0, 0, params_axis, map_axis, map_axis), trees)
+    own = _mapped((0, 0, 0, params_axis, map_axis, map_axis), trees)
     cut = [
         x[order].reshape(n_blocks, block, *x.shape[1:])
         for x, o in zip(leaves, own, strict=True)
@@ -171,25 +191,31 @@ def make_runner(
     record: bool = False,
     keep_states: bool = False,
 ) -> Callable[..., Experiment]:
-    """A compiled `(seeds, params, weights=None) -> Experiment` of numpy arrays.
+    """A compiled `(seeds, params, weights=None, states=None) -> Experiment` of numpy arrays.
 
     `params` are NetworkParams; changing them compiles nothing anew. The other arguments are those
     of `run_experiment`.
     """
 
     @jax.jit
-    def run(numbers: Array, params: NetworkParams, weights: Weights | None) -> Experiment:
+    def run(
+        numbers: Array, params: NetworkParams, weights: Weights | None, states: NetworkState | None
+    ) -> Experiment:
         return run_experiment(
             config, snn_params(config, params), map, keys=seed_keys(numbers),
             n_learn=n_learn, n_test=n_test, n_online=n_online, max_steps=max_steps, block=block,
-            circles=circles, weights=weights, record=record, keep_states=keep_states,
+            circles=circles, weights=weights, states=states, record=record,
+            keep_states=keep_states,
         )  # fmt: skip
 
     def call(
-        seeds: Sequence[int], params: NetworkParams, weights: Weights | None = None
+        seeds: Sequence[int],
+        params: NetworkParams,
+        weights: Weights | None = None,
+        states: NetworkState | None = None,
     ) -> Experiment:
         params = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
-        out = run(jnp.asarray(seeds, jnp.int32), params, weights)
+        out = run(jnp.asarray(seeds, jnp.int32), params, weights, states)
         return jax.tree.map(np.asarray, out)
 
     return call

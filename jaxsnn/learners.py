@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from jaxsnn import navigation, planner, ppo, qlearning, world
+from jaxsnn.way import WayLength
 
 # Greedy tests of the Q-learner after so many training trials, each a multiple of the chunk before
 # it.
@@ -127,6 +128,41 @@ def _ppo_program(config: ppo.PPOConfig, n_test: int, max_steps: int) -> Any:
         return result.metrics, final._replace(robot=robot), success
 
     return jax.jit(jax.vmap(one, (0, None, None)))
+
+
+@functools.partial(jax.jit, static_argnames=("config", "max_steps"))
+def ppo_policies(
+    config: ppo.PPOConfig,
+    params: ppo.PPOParams,
+    map: world.WorldParams,
+    way: WayLength | None,
+    *,
+    keys: Key[Array, " n"],
+    max_steps: int = 200,
+) -> ppo.Result:
+    """Train one policy per key on a map; with `way` the reward counts progress along the way."""
+    env = navigation.navigation_env(map, max_steps=max_steps, way=way)
+    train = ppo.make_train(config, env)
+    return jax.vmap(lambda k: train(params, key=k))(keys)
+
+
+@functools.partial(jax.jit, static_argnames=("config", "max_steps"))
+def drive_policies(
+    config: ppo.PPOConfig,
+    map: world.WorldParams,
+    weights: Any,
+    *,
+    keys: Key[Array, " n trials"],
+    max_steps: int = 200,
+) -> qlearning.Trials:
+    """Trials without exploration of trained policies `[n, ...]`, leaves `[n, trials]`."""
+    env = navigation.navigation_env(map, max_steps=max_steps)
+
+    def one(weights: Any, keys: Array) -> qlearning.Trials:
+        end, success, over = ppo.evaluate(config, env, weights, keys=keys, max_steps=max_steps)
+        return qlearning.Trials(success, over & ~success, end.robot.t, end.length, end.start)
+
+    return jax.vmap(one)(weights, keys)
 
 
 def train_ppo(

@@ -35,9 +35,13 @@ def _positive(name: str, value: Number, *, zero: bool = False) -> float:
 
 def _rows(name: str, values: Any, width: int) -> np.ndarray:
     """Values as float64 `[n, width]`, n = 0 allowed."""
-    rows = (
-        np.asarray(values, np.float64).reshape(-1, width) if len(values) else np.zeros((0, width))
-    )
+    try:
+        rows = np.asarray(values, np.float64) if len(values) else np.zeros((0, width))
+        rows = rows.reshape(1, -1) if rows.ndim == 1 else rows
+    except ValueError:
+        rows = np.zeros((0, 0))
+    if rows.ndim != 2 or rows.shape[1] != width:
+        raise ValueError(f"{name}={values}: expected {width} numbers in each row; check them")
     if not np.isfinite(rows).all():
         raise ValueError(f"{name}={rows.tolist()}: expected finite numbers; one is not finite")
     return rows

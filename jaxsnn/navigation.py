@@ -12,7 +12,8 @@ from jaxtyping import Array, Float, Key
 
 from jaxsnn import world
 from jaxsnn._checks import require_whole
-from jaxsnn.ppo import Env, Transition
+from jaxsnn.ppo_config import Env, Transition
+from jaxsnn.way import WayLength, remaining_way
 
 OBSERVATION_SIZE = world.N_SONARS + 3
 # A full action turns the robot by this much [deg].
@@ -46,15 +47,23 @@ def navigation_reward(
     before: world.WorldState,
     after: world.WorldState,
     outcome: world.Outcome,
+    way: WayLength | None = None,
 ) -> Float[Array, ""]:
     r"""Arrival +2, collision -2, and one for each 100 px that the target comes nearer.
 
     .. math:: r = 2\,[\text{arrived}] - 2\,[\text{collided}] + (d_t - d_{t+1}) / 100
 
-    The last term sums to the distance covered towards the target and so favours no detour.
+    Args:
+        params: the map.
+        before, after: the robot before and after the step.
+        outcome: of the step.
+        way: takes `d` along the shortest way. Without it `d` is the straight distance, whose sum is
+            the distance covered towards the target: every detour has to be paid for first.
     """
 
     def distance(state: world.WorldState) -> Array:
+        if way is not None:
+            return remaining_way(way, state.x, state.y)
         return jnp.hypot(params.target[0] - state.x, params.target[1] - state.y)
 
     ends = jnp.where(outcome.arrived, 2.0, 0.0) - jnp.where(outcome.collided, 2.0, 0.0)
@@ -71,7 +80,10 @@ def start_robot(
 
 
 def drive_robot(
-    params: world.WorldParams, robot: world.WorldState, action: Float[Array, "1"]
+    params: world.WorldParams,
+    robot: world.WorldState,
+    action: Float[Array, "1"],
+    way: WayLength | None = None,
 ) -> Drive:
     """One control step of 15 pixels; an action of 1 (and beyond) steers 45 degrees to the left."""
     steering = STEERING_SCALE * jnp.clip(action[0], -1.0, 1.0)
@@ -79,16 +91,20 @@ def drive_robot(
     return Drive(
         robot=after,
         obs=observation(params, world.observe(params, after)),
-        reward=navigation_reward(params, robot, after, outcome),
+        reward=navigation_reward(params, robot, after, outcome, way),
         outcome=outcome,
     )
 
 
-def navigation_env(params: world.WorldParams, *, max_steps: int = 200) -> Env:
+def navigation_env(
+    params: world.WorldParams, *, max_steps: int = 200, way: WayLength | None = None
+) -> Env:
     """The robot world as an `Env`; an action of 1 steers 45 degrees to the left.
 
     Args:
         params: the map.
+        way: from `way_length`; the reward counts progress along the shortest way instead of the
+            straight distance.
         max_steps: a trial that has not ended after so many control steps is truncated.
 
     Raises:
@@ -102,7 +118,7 @@ def navigation_env(params: world.WorldParams, *, max_steps: int = 200) -> Env:
         return _Navigation(robot, jnp.zeros_like(robot.x), start), obs
 
     def step(state: _Navigation, action: Array) -> Transition:
-        made = drive_robot(params, state.robot, action)
+        made = drive_robot(params, state.robot, action, way)
         terminated = made.outcome.arrived | made.outcome.collided
         moved = jnp.hypot(made.robot.x - state.robot.x, made.robot.y - state.robot.y)
         return Transition(

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from jaxsnn._checks import require, require_key
+from jaxsnn._checks import default_float, require, require_key
 from jaxsnn.config import (
     NetworkConfig,
     NetworkParams,
@@ -55,6 +55,8 @@ class NetworkState(NamedTuple):
     """Weights, membranes of both layers, traces and eligibility of both sets of synapses.
 
     The baselines are running means of what input and hidden neurons fire; see `running_mean`.
+    `recent_turn` is a leaky mean of the robot's turns in this trial [deg], `updates` the number of
+    control steps in which the network has learnt.
     """
 
     weights: Weights
@@ -64,6 +66,8 @@ class NetworkState(NamedTuple):
     stdp_output: STDPState
     baseline_input: Baseline
     baseline_hidden: Baseline
+    recent_turn: Float[Array, ""]
+    updates: Float[Array, ""]
 
 
 class Eligibility(NamedTuple):
@@ -129,6 +133,8 @@ def init(
         ),
         baseline_input=baseline_init(config.n_in),
         baseline_hidden=baseline_init(config.n_hidden),
+        recent_turn=jnp.zeros((), default_float()),
+        updates=jnp.zeros((), default_float()),
     )
 
 
@@ -255,7 +261,16 @@ def step(
         duration=config.dt,
     )
     weights = reinforce(config, params, weights, eligibility, reward)
-    return NetworkState(weights, hidden, output, stdp_hidden, stdp_output, *baselines), spikes
+    state = state._replace(
+        weights=weights,
+        hidden=hidden,
+        output=output,
+        stdp_hidden=stdp_hidden,
+        stdp_output=stdp_output,
+        baseline_input=baselines[0],
+        baseline_hidden=baselines[1],
+    )
+    return state, spikes
 
 
 def _signed_output(config: NetworkConfig, params: NetworkParams, weights: Weights) -> Array:
@@ -322,8 +337,11 @@ def window(
     duration = pre.shape[0] * config.dt
     rates = pre.mean(axis=0), spikes.hidden.mean(axis=0)
     baselines = _update_baselines(params, state, *rates, duration)
-    state = NetworkState(
-        state.weights, state.hidden, state.output, stdp_hidden, stdp_output, *baselines
+    state = state._replace(
+        stdp_hidden=stdp_hidden,
+        stdp_output=stdp_output,
+        baseline_input=baselines[0],
+        baseline_hidden=baselines[1],
     )
     eligibility = Eligibility(
         hidden=first,

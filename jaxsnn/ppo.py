@@ -13,122 +13,18 @@ is the robot world as one. Robots that end a trial start the next one at once, f
 
 from __future__ import annotations
 
-import dataclasses
 import math
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
-import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import optax
 from jaxtyping import Array, Float, Key
 
-from jaxsnn._checks import (
-    concrete,
-    require,
-    require_key,
-    require_keys,
-    require_positive,
-    require_whole,
-)
-
-
-class Transition(NamedTuple):
-    """What an environment answers to an action."""
-
-    state: Any
-    obs: Array  # [o]
-    reward: Array  # []
-    terminated: Array  # [] bool: the task is over, nothing follows
-    truncated: Array  # [] bool: out of steps, the value of what follows still counts
-    success: Array  # [] bool
-
-
-class Env(NamedTuple):
-    """An environment as two pure functions."""
-
-    reset: Callable[[Array], tuple[Any, Array]]  # key -> (state, obs)
-    step: Callable[[Any, Array], Transition]  # (state, action [a]) -> Transition
-    action_size: int
-
-
-@dataclasses.dataclass(frozen=True)
-class PPOConfig:
-    """Sizes and choices; static: a change compiles anew.
-
-    Attributes:
-        n_envs: robots that act at the same time.
-        n_steps: control steps of each of them per update.
-        n_updates, n_epochs, n_minibatches: updates; passes over the data of each, in minibatches.
-        anneal: let the learning rate fall to 0 over the training.
-        hidden: width of the layers of both networks.
-        initial_std: deviation of the action at the start.
-    """
-
-    n_envs: int = 8
-    n_steps: int = 64
-    n_updates: int = 150
-    n_epochs: int = 4
-    n_minibatches: int = 4
-    anneal: bool = True
-    hidden: tuple[int, ...] = (64, 64)
-    initial_std: float = 0.6
-
-    def __post_init__(self) -> None:
-        """Refuse sizes that do not fit together."""
-        for name in ("n_envs", "n_steps", "n_updates", "n_epochs", "n_minibatches"):
-            require_whole(name, getattr(self, name), 1, "give at least one")
-        for width in self.hidden:
-            require_whole("hidden", width, 1, "give widths of layers")
-        require_positive("initial_std", self.initial_std, "0.6 is the default")
-        total = self.n_envs * self.n_steps
-        require(
-            total % self.n_minibatches == 0,
-            f"n_minibatches={self.n_minibatches}: expected a divisor of n_envs * n_steps = {total} "
-            "transitions; change one of them",
-        )
-
-
-class PPOParams(NamedTuple):
-    """Constants of the learner; leaves are floats that may be traced, so a sweep compiles once.
-
-    Attributes:
-        learning_rate: of Adam.
-        discount: `gamma`.
-        gae_lambda: `lambda` of the advantage estimates.
-        clip: largest change of the policy's ratio that still counts.
-        value_coef, entropy_coef: weights in the loss.
-        max_grad_norm: norm to which a gradient is cut.
-    """
-
-    learning_rate: float | Float[Array, ""] = 1e-3
-    discount: float | Float[Array, ""] = 0.98
-    gae_lambda: float | Float[Array, ""] = 0.95
-    clip: float | Float[Array, ""] = 0.2
-    value_coef: float | Float[Array, ""] = 0.5
-    entropy_coef: float | Float[Array, ""] = 0.0
-    max_grad_norm: float | Float[Array, ""] = 0.5
-
-
-def check_ppo(params: PPOParams) -> None:
-    """Refuse constants with which nothing is learnt; traced values pass.
-
-    Raises:
-        ValueError: names the constant, its value and the fix.
-    """
-    for name in ("learning_rate", "clip", "max_grad_norm"):
-        require_positive(name, getattr(params, name), "the default is a good start")
-    for name in ("value_coef", "entropy_coef"):
-        require_positive(name, getattr(params, name), "0 leaves the term out", zero=True)
-    for name in ("discount", "gae_lambda"):
-        require_positive(name, getattr(params, name), "give a number in [0, 1]", zero=True)
-        value = concrete(getattr(params, name))
-        if value is not None:
-            require(
-                bool((value <= 1.0).all()),
-                f"{name}={value.max():g}: expected a number in [0, 1]; lower it",
-            )
+from jaxsnn._checks import require_key, require_keys, require_whole
+from jaxsnn.actor_critic import act, actor_critic, log_prob
+from jaxsnn.ppo_config import Env, PPOConfig, PPOParams, check_ppo
 
 
 class Rollout(NamedTuple):
@@ -149,44 +45,6 @@ class Result(NamedTuple):
 
     weights: Any
     metrics: Rollout
-
-
-class ActorCritic(nn.Module):
-    """Two tanh networks: mean and log deviation of a Gaussian action, and the value."""
-
-    action_size: int
-    hidden: tuple[int, ...]
-    initial_std: float
-
-    @nn.compact
-    def __call__(self, obs: Array) -> tuple[Array, Array, Array]:
-        """Mean `[a]`, log deviation `[a]`, value `[]`."""
-
-        def tower(size: int, scale: float) -> Array:
-            x = obs
-            for width in self.hidden:
-                x = nn.tanh(nn.Dense(width, kernel_init=nn.initializers.orthogonal(2**0.5))(x))
-            return nn.Dense(size, kernel_init=nn.initializers.orthogonal(scale))(x)
-
-        log_std = self.param(
-            "log_std", nn.initializers.constant(math.log(self.initial_std)), (self.action_size,)
-        )
-        return tower(self.action_size, 0.01), log_std, tower(1, 1.0)[..., 0]
-
-
-def _network(config: PPOConfig, env: Env) -> ActorCritic:
-    return ActorCritic(env.action_size, config.hidden, config.initial_std)
-
-
-def _log_prob(action: Array, mean: Array, log_std: Array) -> Array:
-    z = (action - mean) * jnp.exp(-log_std)
-    return jnp.sum(-0.5 * z**2 - log_std - 0.5 * math.log(2.0 * math.pi))
-
-
-def act(config: PPOConfig, env: Env, weights: Any, obs: Float[Array, "o"]) -> Float[Array, "a"]:
-    """The action without exploration: the mean of the policy."""
-    apply: Any = _network(config, env).apply
-    return apply(weights, obs)[0]
 
 
 def gae(
@@ -243,7 +101,7 @@ def make_train(config: PPOConfig, env: Env) -> Callable[..., Result]:
     Source: Schulman et al. (2017), Eq. 7 and 9; one jit for the run as in PureJaxRL (Lu et al.,
         2022).
     """
-    network = _network(config, env)
+    network = actor_critic(config, env)
     apply: Any = network.apply
     n_gradients = config.n_updates * config.n_epochs * config.n_minibatches
 
@@ -270,7 +128,7 @@ def make_train(config: PPOConfig, env: Env) -> Callable[..., Result]:
         row = {
             "obs": obs,
             "action": action,
-            "log_prob": _log_prob(action, mean, log_std),
+            "log_prob": log_prob(action, mean, log_std),
             "value": value,
             "next_value": value_of(weights, made.obs),
             "reward": made.reward,
@@ -284,8 +142,7 @@ def make_train(config: PPOConfig, env: Env) -> Callable[..., Result]:
         weights: Any, params: PPOParams, batch: dict[str, Array]
     ) -> tuple[Array, dict[str, Array]]:
         mean, log_std, value = jax.vmap(lambda o: apply(weights, o))(batch["obs"])
-        log_prob = jax.vmap(_log_prob)(batch["action"], mean, log_std)
-        log_ratio = log_prob - batch["log_prob"]
+        log_ratio = jax.vmap(log_prob)(batch["action"], mean, log_std) - batch["log_prob"]
         ratio = jnp.exp(log_ratio)
         gain = batch["advantage"]
         gain = (gain - jnp.mean(gain)) / (jnp.std(gain) + 1e-8)

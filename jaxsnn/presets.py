@@ -2,7 +2,8 @@
 
 The reading "literal" is the source wherever it speaks; what it leaves open (window, learning rate,
 time constant of the eligibility trace, threshold) has our values in both. "tuned" adds options;
-`docs/snn_networks.md` says what each one does and how its value was chosen.
+"guided" takes an input group for each interval, memory of the last turns and a graded reward for
+maps that need a detour. `docs/snn_networks.md` says what each option does and how it was chosen.
 """
 
 from __future__ import annotations
@@ -18,6 +19,7 @@ from jaxsnn.config import (
     network_params,
 )
 from jaxsnn.plasticity import STDPParams
+from jaxsnn.turn_goal import TurnGoalParams
 
 # Per reading: changes of NetworkConfig, of NetworkParams, of STDPParams and of RewardParams.
 READINGS: dict[str, dict[str, dict[str, Any]]] = {
@@ -47,12 +49,31 @@ READINGS: dict[str, dict[str, dict[str, Any]]] = {
         },
     },
 }
+READINGS["guided"] = {
+    "config": {
+        **READINGS["tuned"]["config"],
+        "input_code": "interval",
+        "turn_groups": True,
+        "guidance": "graded",
+        "group_exc": 5,
+        "group_inh": 5,
+    },
+    "params": {
+        **READINGS["tuned"]["params"],
+        "max_turn": 60.0,
+        "anneal": 500.0,
+        "goal": TurnGoalParams(),
+    },
+    "stdp": READINGS["tuned"]["stdp"],
+    "reward": READINGS["tuned"]["reward"],
+}
 # Learning rates relative to that of S4. The additive rule moves a weight by mV and the
 # multiplicative one by a fraction, and inputs of S1 and S2 fire at 0.4 times the rate. "tuned":
 # best success in testing on Scenarios 1 and 2 (results/study_snn_gamma.json).
 GAMMA = {
     "literal": {"S1": 3.0, "S2": 1.0, "S3": 3.0, "S4": 1.0},
     "tuned": {"S1": 27.0, "S2": 9.0, "S3": 3.0, "S4": 1.0},
+    "guided": {"S1": 3.0, "S2": 1.0, "S3": 3.0, "S4": 1.0},
 }
 
 

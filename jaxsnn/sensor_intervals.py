@@ -15,6 +15,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
 N_SONAR, N_DISTANCE, N_ANGLE = 3, 4, 4
+N_NEAR, N_OCTANT = 4, 8
 _SONAR_STEP = 100.0  # [px]
 _DISTANCE_STEP = 200.0  # [px]
 
@@ -29,6 +30,30 @@ def sonar_interval(sonar: Float[Array, "*n"]) -> Int[Array, "*n"]:
         [0, 0, 1, 2]
     """
     return jnp.clip(jnp.floor(sonar / _SONAR_STEP), 0, N_SONAR - 1).astype(jnp.int32)
+
+
+def near_interval(sonar: Float[Array, "*n"]) -> Int[Array, "*n"]:
+    """0 to 3 for a reading below 50, 100, 200 px or beyond: the nearest interval cut in two.
+
+    Source: ours.
+
+    Example:
+        >>> near_interval(jnp.array([49.0, 50.0, 100.0, 300.0])).tolist()
+        [0, 1, 2, 3]
+    """
+    return sum((sonar >= bound).astype(jnp.int32) for bound in (50.0, 100.0, 200.0))
+
+
+def angle_octant(angle: Float[Array, "*n"]) -> Int[Array, "*n"]:
+    """0 to 7: eighth of the circle that holds the target, 0 ahead, counted counter-clockwise.
+
+    Source: ours.
+
+    Example:
+        >>> angle_octant(jnp.array([0.0, 45.0, 180.0, -90.0])).tolist()
+        [0, 1, 4, 6]
+    """
+    return jnp.mod(jnp.floor((angle + 22.5) / 45.0), N_OCTANT).astype(jnp.int32)
 
 
 def distance_interval(distance: Float[Array, "*n"]) -> Int[Array, "*n"]:

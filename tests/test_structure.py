@@ -45,7 +45,6 @@ LONGER = {
     "jaxsnn.maps",
     "jaxsnn.network",
     "jaxsnn.plots",
-    "jaxsnn.ppo",
     "jaxsnn.world",
     "snn_fusion_failure.documentation.documented",
     "scripts.benchmarks.bench_fusion",

@@ -6,9 +6,10 @@
 Rows are the three scenarios, their detour readings D1 to D3 (`jaxsnn.scenarios.detour`) and the
 held-out detour family: there a learner trains on one map of the family's training split and drives
 on maps of its test split that nothing was tuned on, weights or table frozen. Metrics: `sr_testing`
-after the source's 20 learning trials (2,000 for Q-learning), `sr_testing_60_trials` with
-`--learn-trials 60`, and `path_ratio` of the trials that arrived. Networks use the seeds of the
-tables of record from 0 on.
+after the source's 20 learning trials (2,000 for Q-learning, about 10,000 for PPO, whose reward
+counts progress along the shortest way), `sr_testing_60_trials` with `--learn-trials 60`, and
+`path_ratio` of the trials that arrived. `S4` is the reading "tuned", `S4_literal` the source's,
+`S4_guided` the one with a graded reward. Networks use the seeds of the tables of record from 0 on.
 
 Rows go to `results/study_detour.json` as each one ends; one that is there already with as many
 seeds is skipped, so the study can be broken off and gone on with. Drivers take seconds, Q-learning
@@ -28,9 +29,12 @@ from snn_fusion_failure.runs.origin import check_recordable
 
 ROWS = ("Scenario 1", "Scenario 2", "Scenario 3", "D1", "D2", "D3", "held-out detour family")
 DRIVERS = ("blind", "reflex_60", "reflex_100")
-NETWORKS = ("S1", "S2", "S3", "S4", "S4_literal")
+NETWORKS = ("S1", "S2", "S3", "S4", "S4_literal", "S4_guided", "S3_guided")
+LEARNERS = ("q_learning", "ppo")
 FAMILY = ROWS[-1]
 UNITS = {"path_ratio": "1"}
+PPO = {"n_envs": 32, "n_steps": 128, "n_updates": 100, "n_minibatches": 8, "initial_std": 0.8}
+PPO_PARAMS = {"learning_rate": 1e-3}
 TITLE = "Drivers and learners on maps that need a detour"
 
 
@@ -38,7 +42,7 @@ TITLE = "Drivers and learners on maps that need a detour"
 class Study:
     """Fill the table of detours."""
 
-    models: tuple[str, ...] = (*DRIVERS, "q_learning", "S4", "S4_literal", "S1", "S2", "S3")
+    models: tuple[str, ...] = (*DRIVERS, *LEARNERS, "S4_guided", "S4", "S4_literal")
     rows: tuple[str, ...] = ROWS
     seeds: int = 16
     """Robots, or learners of Q-learning."""
@@ -174,11 +178,8 @@ def run_q_learning(config: Study, model: str, row: str) -> dict[str, list[float]
     """Tables trained for 2,000 trials on the row's map, greedy in testing."""
     import jax
     import jax.numpy as jnp
-    import numpy as np
 
     from jaxsnn import qlearning
-    from jaxsnn.status import Status
-    from jaxsnn.trials import TrialResult
 
     run = jax.jit(qlearning.run_trials, static_argnames=("n_trials", "max_steps", "learn"))
     params = qlearning.QParams(*(jnp.float32(v) for v in qlearning.QParams()))
@@ -190,25 +191,49 @@ def run_q_learning(config: Study, model: str, row: str) -> dict[str, list[float]
             learn=True, first_trial=done,
         )  # fmt: skip
     greedy = params._replace(epsilon=jnp.float32(0.0))
-    held: dict[str, Any] = {}
 
-    def phase(map: Any, keys: Any, n: int) -> Any:
-        _, trials = run(
+    def drive(map: Any, key: Any, n: int) -> Any:
+        keys = jax.random.split(key, config.seeds)
+        return run(
             greedy, map, tables, keys=keys, n_trials=n, max_steps=config.max_steps, learn=False
-        )
-        status = jnp.where(trials.arrived, Status.ARRIVED, Status.TIMEOUT)
-        status = jnp.where(trials.collided, Status.COLLIDED, status)
-        held.setdefault("starts", []).append(np.asarray(trials.start))
-        return TrialResult(status, trials.steps, trials.length, jnp.zeros(()), None)
+        )[1]
+
+    return _test_learners(config, row, drive)
+
+
+def run_ppo(config: Study, model: str, row: str) -> dict[str, list[float]]:
+    """Policies trained with a reward along the shortest way; sonars and angle are all they see."""
+    import jax
+    import jax.numpy as jnp
+
+    from jaxsnn import learners, ppo, way
+
+    sizes, map = ppo.PPOConfig(**PPO), train_map(row)
+    params = jax.tree.map(jnp.float32, ppo.PPOParams(**PPO_PARAMS))
+    weights = learners.ppo_policies(
+        sizes, params, map, way.way_length(map),
+        keys=jax.random.split(jax.random.key(41), config.seeds), max_steps=config.max_steps,
+    ).weights  # fmt: skip
+
+    def drive(map: Any, key: Any, n: int) -> Any:
+        keys = jax.random.split(key, (config.seeds, n))
+        return learners.drive_policies(sizes, map, weights, keys=keys, max_steps=config.max_steps)
+
+    return _test_learners(config, row, drive)
+
+
+def _test_learners(config: Study, row: str, drive: Any) -> dict[str, list[float]]:
+    """Test `drive(map, key, n_trials) -> qlearning.Trials` on the test maps of a row."""
+    import jax
+    import numpy as np
+
+    from jaxsnn.status import Status
 
     n, maps = trials_per_map(config, row), test_maps(config, row)
-    results = [phase(m, jax.random.split(jax.random.key(37 + i), config.seeds), n)
-               for i, m in enumerate(maps)]  # fmt: skip
+    done = [drive(m, jax.random.key(37 + i), n) for i, m in enumerate(maps)]
+    status = np.where(np.stack([d.arrived for d in done]), Status.ARRIVED, Status.TIMEOUT)
     return values_of(
-        maps,
-        np.stack([np.asarray(r.status) for r in results]),
-        np.stack([np.asarray(r.path) for r in results]),
-        np.stack(held["starts"]),
+        maps, status, np.stack([d.length for d in done]), np.stack([d.start for d in done])
     )
 
 
@@ -216,12 +241,12 @@ def runner(model: str) -> Any:
     """What runs a model."""
     if model in DRIVERS:
         return run_driver
-    return run_q_learning if model == "q_learning" else run_network
+    return {"q_learning": run_q_learning, "ppo": run_ppo}.get(model, run_network)
 
 
 def main(config: Study) -> dict[str, float]:
     """Run the cells that are missing; returns success by model and row."""
-    known = (*DRIVERS, "q_learning", *NETWORKS)
+    known = (*DRIVERS, *LEARNERS, *NETWORKS)
     for name, given, allowed in (("models", config.models, known), ("rows", config.rows, ROWS)):
         if unknown := [g for g in given if g not in allowed]:
             raise ValueError(f"{name}={unknown}: expected some of {list(allowed)}; choose")

@@ -87,6 +87,11 @@ RULES = (
         f"{_ROBOT} --models blind --rows D1 --test-trials 1",
         forget="results/study_detour.json",
     ),
+    Rule(
+        "study_lifelong.py",
+        f"{_ROBOT} --models blind --rows 'weak motor' --trials 1",
+        forget="results/study_lifelong.json",
+    ),
     Rule("study_snn.py gamma", f"{_ROBOT} --test-trials 1", forget="results/study_snn_gamma.json"),
     Rule(
         "study_snn.py readings",
@@ -225,7 +230,7 @@ AREAS = {
     ),
     "robots": (
         "train_snn", "study_transfer", "study_snn", "figures_snn", "compare_snn", "bench_snn",
-        "train_rl", "study_detour",
+        "train_rl", "study_detour", "study_lifelong",
     ),
     "sweeps": ("sweep", "bench_sweep"),
     "fusion": (

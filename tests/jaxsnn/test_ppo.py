@@ -7,7 +7,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsnn import navigation, ppo, scenarios
+from jaxsnn import actor_critic, navigation, ppo, ppo_config, scenarios
 
 
 def test_advantages_in_closed_form() -> None:
@@ -49,10 +49,10 @@ def _hit_the_mark(discount_steps: int) -> ppo.Env:
         obs = draw(key)
         return (obs, jnp.zeros((), jnp.int32)), obs
 
-    def step(state: tuple[jax.Array, jax.Array], action: jax.Array) -> ppo.Transition:
+    def step(state: tuple[jax.Array, jax.Array], action: jax.Array) -> ppo_config.Transition:
         obs, t = state
         last = t + 1 >= discount_steps
-        return ppo.Transition(
+        return ppo_config.Transition(
             (obs, t + 1), obs, 1.0 - jnp.sum((action - obs) ** 2), last, jnp.zeros((), bool), last
         )
 
@@ -70,7 +70,9 @@ def test_it_finds_the_known_best_action_and_value() -> None:
     np.testing.assert_allclose(action, obs, atol=0.15)
     # The observation does not tell the two steps of an episode apart: the value that fits both is
     # the mean of (1 + 0.5) and 1 times the reward, less the exploration that is left.
-    value = jax.vmap(lambda o: ppo._network(config, env).apply(result.weights, o)[2])(obs)
+    value = jax.vmap(lambda o: actor_critic.actor_critic(config, env).apply(result.weights, o)[2])(
+        obs
+    )
     reward = float(result.metrics.reward[-10:].mean())
     assert reward > 0.85
     np.testing.assert_allclose(value.mean(), 1.25 * reward, atol=0.1)

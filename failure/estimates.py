@@ -24,6 +24,10 @@ class Estimate(NamedTuple):
         n_effective: effective number of failing samples (failures for Monte Carlo; replicates
             for subset simulation).
         verdict: "good", or what stands against the estimate and what to do.
+
+    Example:
+        >>> Estimate(1e-3, 8e-4, 1.2e-3, 5000, 0, 210.0).verdict
+        'good'
     """
 
     probability: float

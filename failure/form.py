@@ -72,6 +72,12 @@ def design_points(
         ValueError: a point that does not fail, named by its row.
 
     Source: Rackwitz and Fiessler (1978); Zhang and Der Kiureghian (1995) for the merit function.
+
+    Example:
+        >>> failures = np.array([[3.0, 2.0], [1.0, 5.0]])
+        >>> points, used = design_points(lambda x: x.sum(axis=1), 4.0, failures)
+        >>> np.round(points, 1).tolist()
+        [[2.0, 2.0]]
     """
     check_threshold(threshold)
     u = np.array(failures, np.float64)

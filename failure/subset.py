@@ -230,6 +230,12 @@ def subset_simulation(
 
     Source: Au and Beck (2001); Papaioannou et al. (2015) for the moves. Deviation: replicates in
     the place of the analytic coefficient of variation.
+
+    Example:
+        >>> import jax
+        >>> found = subset_simulation(lambda x: x[:, 0], 3.0, 4, key=jax.random.key(0), explore=0)
+        >>> found.lower < 1.35e-3 < found.upper
+        True
     """
     check_threshold(threshold)
     if replicates < 3:

@@ -83,6 +83,9 @@ class ModelConfig:
         weight_sharing: auxiliary paths share the encoders; else they have their own (ablation).
         loss: terms of the loss and its gradient paths; None for those of the model's recipe.
         targets: the lattice of Equation 3.2.
+
+    Raises:
+        ValueError, TypeError: what cannot be built, by name and value.
     """
 
     model: str = "argate_l"
@@ -205,6 +208,9 @@ class TrainConfig:
         schedule: of the learning rate, `"cosine"` to zero or `"constant"`.
         clip_norm: bound of the gradient's global norm.
         jitter: standard deviation of a random gain per channel and example, in training.
+
+    Raises:
+        ValueError, TypeError: sizes that make no run, by name and value.
     """
 
     epochs: int = 20

@@ -42,6 +42,9 @@ class EncoderConfig:
         ranks: share of training rows below each level, for the first rows of the tables.
         known_readings: a table gives a token of its own for readings that are no level.
         backend: how `conv1d` is computed; `"matmul"` for CPU, `"conv"` for accelerators.
+
+    Raises:
+        ValueError: sizes that cannot be built, or readings that are not sorted.
     """
 
     features: int = 64

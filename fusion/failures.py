@@ -29,6 +29,16 @@ class Protocol:
         low, high: bounds (inclusive) of the number of failing channels of a corrupted example.
         failing: the channels that fail; empty means drawn anew for each example.
         clean_fraction: share of examples kept clean (a third in the source).
+
+    Raises:
+        ValueError, TypeError: counts, channels or a share out of range, by name and value.
+
+    Example:
+        >>> Protocol(n_channels=9, low=1, high=3).high
+        3
+        >>> Protocol(n_channels=3, low=2, high=1)
+        Traceback (most recent call last):
+        ValueError: high=1: expected a whole number 2..3; raise it
     """
 
     n_channels: int
@@ -60,6 +70,9 @@ class Protocol:
 def no_failure(channels: Sequence[str]) -> Protocol:
     """All channels of all examples stay clean.
 
+    Returns:
+        A protocol whose masks are False.
+
     Example:
         >>> no_failure(("a", "b")).high
         0
@@ -84,6 +97,9 @@ def fixed_failing(
 ) -> Protocol:
     """The named channels fail in every corrupted example.
 
+    Returns:
+        The protocol.
+
     Raises:
         ValueError: an unknown, repeated or no name; the message lists the known channels.
 
@@ -106,6 +122,9 @@ def random_failing(
     channels: Sequence[str], n_clean: int, *, clean_fraction: float = 1.0 / 3.0
 ) -> Protocol:
     """Each corrupted example keeps `n_clean` channels, drawn for this example.
+
+    Returns:
+        The protocol.
 
     Raises:
         TypeError, ValueError: `n_clean` is not a whole number in 0..K-1.
@@ -142,6 +161,11 @@ def generalisation(
         ValueError: a range that does not lie in 1..K.
 
     Source: Shim (2020), section 3.3.3.2 and Tables 3.3 and 3.6, failing sensor generation test.
+
+    Example:
+        >>> train, test = generalisation(("a", "b", "c"), (1, 1), (2, 3))
+        >>> (train.low, train.high), (test.low, test.high)
+        ((1, 1), (2, 3))
     """
     k = len(_channels(channels))
     for part, (low, high) in (("train", train), ("test", test)):

@@ -223,6 +223,10 @@ def finish(
 
     Returns:
         The network with temperature, and with a monitor trained on failures of every kind.
+
+    Raises:
+        ValueError: the network and the data set disagree in shape.
+        TypeError: `data` is no data set.
     """
     check_type("data", data, Dataset, "give validation_split(data)")
     output = test_output(model, state, data, noise, key=key)

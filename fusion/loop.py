@@ -38,6 +38,10 @@ class Corruption:
             the same when None.
         redraw: draw masks and noise anew in every epoch; False is the literal reading of the
             source, drawn once.
+
+    Raises:
+        ValueError: an unknown kind, or protocols for different numbers of channels.
+        TypeError: what is no protocol.
     """
 
     train: Protocol
@@ -213,6 +217,9 @@ def test_output(
 
     Returns:
         Logits, fusion weights, mask of failed sensors and labels, in the order of the test rows.
+
+    Raises:
+        ValueError: an unknown kind, or the network and the data set disagree in shape.
     """
     _check(model, data, noise)
     check_key(key)

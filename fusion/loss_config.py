@@ -90,6 +90,9 @@ class LossConfig:
         uniform_floor: share of equal weighting mixed into the alpha term's weights, in [0, 1], so
             that the path of a sensor with a low weight goes on learning.
         label_smoothing: share of the label mass spread over all classes, in the main loss.
+
+    Raises:
+        ValueError: a share out of range, or a combination that means nothing.
     """
 
     auxiliary: bool = True

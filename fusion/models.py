@@ -262,6 +262,15 @@ def export(params: Params) -> Params:
     """What inference needs: the main model's parameters, without auxiliary paths and lattice.
 
     A network with a neighbourhood head needs its memory, too: clean training rows.
+
+    Returns:
+        The tree that `predict` takes.
+
+    Example:
+        >>> from fusion.config import ModelConfig
+        >>> params = init(jax.random.key(0), ModelConfig("baseline", n_sensors=3, n_times=1))
+        >>> export(params) is params["main"]
+        True
     """
     if "memory" in params:
         return params["main"] | {"memory": params["memory"]}

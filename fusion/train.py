@@ -262,14 +262,17 @@ def make_train(
 
     For sweeps: `jax.vmap(lambda key: train(hyper, x, y, key=key))` trains a batch of seeds and
     `jax.vmap(lambda hyper: train(hyper, x, y, key=key))` a batch of hyper-parameters in one
-    program. It draws the same keys as `fusion.fit`, so that one run of either gives the same
-    network.
+    program. It draws the keys of `fusion.fit`: one run of either gives the same network.
 
     Returns:
         A function whose metrics have a leading axis of epochs.
 
     Raises:
         ValueError: an unknown kind, a protocol for another number of sensors, too few examples.
+
+    Example:
+        >>> clean = Protocol(n_channels=3, low=0, high=0)
+        >>> train = make_train(ModelConfig("baseline", n_sensors=3), TrainConfig(), 640, clean)
     """
     check_kinds("kind", kind)
     if protocol.n_channels != model.n_sensors:

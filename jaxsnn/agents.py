@@ -68,6 +68,9 @@ class SNNMemory(NamedTuple):
 def snn_params(config: NetworkConfig, params: NetworkParams) -> SNNParams:
     """Parameters of the agent: checked constants and the pair kernel.
 
+    Returns:
+        SNNParams: the constants, and the kernel of one window of `config.hold_steps`.
+
     Raises:
         ValueError: a constant is not acceptable (traced constants are not checked).
     """

@@ -52,6 +52,9 @@ class NetworkConfig:
             left and to the right: what a network without recurrence has of memory.
         guidance: rewards on the way by the "nearest" obstacle (the source) or "graded" from all
             sonars (`turn_goal.turn_reward`).
+
+    Raises:
+        ValueError, TypeError: what makes no network, by name and value.
     """
 
     rule: Rule = "multiplicative"

@@ -300,6 +300,12 @@ def random_map(
 
     Raises:
         ValueError: no solvable map within `attempts`, or the ranges are impossible.
+
+    Example:
+        >>> import jax
+        >>> map = random_map(key=jax.random.key(0))
+        >>> map.target.shape, bool(map.circle_mask.any() | map.segment_mask.any())
+        ((2,), True)
     """
     require_key(key)
     if not 0 <= n_obstacles[0] <= n_obstacles[1]:

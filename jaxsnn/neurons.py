@@ -87,7 +87,14 @@ def check_lif(params: LIFParams, *, dt: float) -> None:
 
 
 def lif_init(params: LIFParams, n: int) -> LIFState:
-    """`n` neurons at rest, none of them refractory, in jax's default float (float64 under x64)."""
+    """`n` neurons at rest, none of them refractory, in jax's default float (float64 under x64).
+
+    Returns:
+        LIFState, leaves `[n]`.
+
+    Raises:
+        ValueError: `params` holds a constant that no neuron has, or `n` is not positive.
+    """
     require_whole("n", n, 1, "a layer needs at least one neuron")
     dtype = default_float()
     v = jnp.full((n,), 1.0, dtype) * jnp.asarray(params.v_rest, dtype)
@@ -151,7 +158,11 @@ def lif_step(
 def lif_scan(
     params: LIFParams, state: LIFState, jumps: Float[Array, "t n"], *, dt: float
 ) -> tuple[LIFState, Bool[Array, "t n"], Float[Array, "t n"]]:
-    """`lif_step` over the rows of `jumps` [mV]; returns the last state, spikes and potentials."""
+    """`lif_step` over the rows of `jumps` [mV]; returns the last state, spikes and potentials.
+
+    Returns:
+        The last state, spikes `[t, n]` and potentials before the reset `[t, n]` [mV].
+    """
 
     def body(carry: LIFState, jump: Array) -> tuple[LIFState, tuple[Array, Array]]:
         carry, spikes = lif_step(params, carry, 0.0, jump, dt=dt)

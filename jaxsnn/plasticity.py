@@ -100,7 +100,14 @@ def check_bounds(
 
 
 def stdp_init(n_pre: int, n_post: int) -> STDPState:
-    """No spikes so far: traces and eligibility are zero, in jax's default float."""
+    """No spikes so far: traces and eligibility are zero, in jax's default float.
+
+    Returns:
+        STDPState, traces `[n_pre]` and `[n_post]`, eligibility `[n_pre, n_post]`.
+
+    Raises:
+        ValueError: a size is not positive.
+    """
     require_whole("n_pre", n_pre, 1, "a layer needs at least one neuron")
     require_whole("n_post", n_post, 1, "a layer needs at least one neuron")
     dtype = default_float()

@@ -93,6 +93,9 @@ def preset(
         reading: "literal" or "tuned".
         config, params, stdp, reward: changes of single fields.
 
+    Returns:
+        NetworkConfig and NetworkParams.
+
     Raises:
         ValueError: a name is unknown or a constant is not acceptable.
 

@@ -187,7 +187,11 @@ def scale_by_remaining_turn(
 def terminal_reward(
     params: RewardParams, collided: Bool[Array, ""], arrived: Bool[Array, ""]
 ) -> Float[Array, ""]:
-    """`R_col`, `R_arr` or 0, for the whole network (section 2.2.2.1)."""
+    """`R_col`, `R_arr` or 0, for the whole network (section 2.2.2.1).
+
+    Returns:
+        The reward `[]`.
+    """
     return jnp.where(collided, params.collision, jnp.where(arrived, params.arrival, 0.0))
 
 

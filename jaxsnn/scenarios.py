@@ -75,6 +75,9 @@ _SCENARIOS = {1: _scenario_1, 2: _scenario_2, 3: _scenario_3}
 def scenario(number: int) -> WorldParams:
     """The map of Scenario 1, 2 or 3.
 
+    Returns:
+        WorldParams with the padding of `make_map`.
+
     Raises:
         ValueError: there is no such scenario.
 
@@ -146,6 +149,9 @@ def detour(number: int) -> WorldParams:
     What the text fixes is kept (target, start circles, kinds of obstacles). Drivers that learn
     nothing, blind or with a reflex at 60 or 100 pixels, do not get through (`jaxsnn.drivers`), and
     the shortest paths are nearer to the length of the source's trials, N_mv times 15 pixels.
+
+    Returns:
+        WorldParams with the padding of `make_map`.
 
     Raises:
         ValueError: there is no such map.

@@ -51,7 +51,18 @@ class _Carry(NamedTuple):
 
 
 def success_rate(result: TrialResult) -> Float[Array, "*robots"]:
-    """Arrivals per trial (the source's `SR`), over the last axis."""
+    """Arrivals per trial (the source's `SR`), over the last axis.
+
+    Returns:
+        Shares in [0, 1], `[robots]`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> result = TrialResult(*[None] * len(TrialResult._fields))
+        >>> ended = jnp.array([[Status.ARRIVED, Status.COLLIDED, Status.ARRIVED, Status.COLLIDED]])
+        >>> success_rate(result._replace(status=ended)).tolist()
+        [0.5]
+    """
     return jnp.mean((result.status == Status.ARRIVED).astype(default_float()), axis=-1)
 
 

@@ -36,6 +36,12 @@ class WorldParams(NamedTuple):
     """A map and the constants of its robot; made by `jaxsnn.maps.make_map`.
 
     Every leaf is an array, so maps of equal padding can be stacked and vmapped.
+
+    Example:
+        >>> from jaxsnn import scenarios
+        >>> params = scenarios.scenario(1)
+        >>> float(params.speed), params._replace(speed=params.speed / 3).speed.tolist()
+        (15.0, 5.0)
     """
 
     segments: Array  # [s, 4] sides (ax, ay, bx, by) of closed polygons [px]

@@ -23,10 +23,16 @@ def get(name: str) -> Circuit:
 
     Args:
         name: a key of `CIRCUITS`.
+
     Returns:
         Circuit; the same object at every call.
+
     Raises:
         ValueError: unknown name.
+
+    Example:
+        >>> get("ldo").n_dims, get("ldo").spec_names[0]
+        (60, 'quiescent_current')
     """
     if name not in CIRCUITS:
         raise ValueError(f"circuit={name!r}: expected one of {', '.join(map(repr, CIRCUITS))}")

@@ -27,6 +27,14 @@ class AcquisitionConfig:
     `n_raw` random points are ranked, the best `n_restarts` are improved by at most
     `max_evals` evaluations each. Half of the raw points lie around the best inputs so far: in
     60 dimensions uniform points almost never start an ascent that ends well.
+
+    Raises:
+        ValueError: an unknown name, a batch that the acquisition cannot fill, a number out
+            of range.
+
+    Example:
+        >>> AcquisitionConfig("pbo", batch_size=5).beta
+        2.0
     """
 
     name: str = "log_ei"

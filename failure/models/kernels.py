@@ -18,6 +18,14 @@ class GPConfig:
 
     The lengthscale prior is LogNormal(sqrt(2) + log(d) / 2, sqrt(3)) and the noise prior
     LogNormal(-4, 1), both on the values themselves (no Jacobian): Hvarfner et al. (2024).
+
+    Raises:
+        ValueError: an unknown kernel, a prior without a positive scale, a noise floor that is not
+            positive.
+
+    Example:
+        >>> GPConfig(kernel="rbf").min_noise
+        0.0001
     """
 
     kernel: str = "matern52"

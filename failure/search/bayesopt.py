@@ -362,6 +362,9 @@ def tell(
         y: `[S, q]`, larger is worse; a value that is not finite counts as invalid.
         status: `[S, q]`, see `failure.Status`, 0 where valid; all zero without.
 
+    Returns:
+        The history with these evaluations; nothing is pending.
+
     Raises:
         ValueError: nothing was asked, or the shape is another.
     """

@@ -56,7 +56,11 @@ TrainSpace = Callable[[SearchConfig, Any, np.ndarray, np.ndarray], Any]
 
 
 def init(config: SearchConfig) -> SearchState:
-    """An empty history."""
+    """An empty history.
+
+    Returns:
+        SearchState without evaluations, one row per seed.
+    """
     s, dim = len(config.seeds), config.task.dim
     empty = np.zeros((s, 0))
     return SearchState(
@@ -65,12 +69,23 @@ def init(config: SearchConfig) -> SearchState:
 
 
 def best_so_far(y: np.ndarray) -> np.ndarray:
-    """Running worst case `[S, n]`; -inf before the first valid evaluation."""
+    """Running worst case `[S, n]`; -inf before the first valid evaluation.
+
+    Returns:
+        `[S, n]`, never falling along the evaluations.
+
+    Example:
+        >>> best_so_far(np.array([[1.0, 3.0, 2.0]])).tolist()
+        [[1.0, 3.0, 3.0]]
+    """
     return np.maximum.accumulate(np.where(np.isfinite(y), y, -np.inf), axis=1)
 
 
 def first_hit(y: np.ndarray, threshold: float) -> np.ndarray:
     """Simulations up to and with the first failure (`y > threshold`) per seed, NaN for none.
+
+    Returns:
+        `[S]` counts as floats.
 
     Raises:
         ValueError: the threshold is NaN, which nothing exceeds.

@@ -115,9 +115,19 @@ def start_from(config: SearchConfig, x: np.ndarray, y: np.ndarray) -> SearchStat
         x: `[n, D]` in sigma.
         y: `[n]`, larger is worse.
 
+    Returns:
+        SearchState as after `n` evaluations of every seed.
+
     Raises:
         ValueError: wrong shapes; a row that is not finite or lies outside the set, named; a
             random embedding, in which given points have no coordinates.
+
+    Example:
+        >>> from failure.search.task import Task
+        >>> config = SearchConfig(Task("box", 3.0, 2), "full", seeds=(0, 1), n_init=3, n_total=8)
+        >>> x = np.array([[0.0, 1.0], [2.0, -1.0], [0.5, 0.5]])
+        >>> start_from(config, x, np.arange(3.0)).y.tolist()
+        [[0.0, 1.0, 2.0], [0.0, 1.0, 2.0]]
     """
     x, y = np.asarray(x, np.float64), np.asarray(y, np.float64)
     if x.ndim != 2 or x.shape[1] != config.task.dim or y.shape != x.shape[:1]:

@@ -124,6 +124,13 @@ class FunctionSimulator:
     Raises:
         ValueError: settings out of range.
         SimulatorError: the function cannot be imported, or never works.
+
+    Example:
+        >>> import math
+        >>> simulate = FunctionSimulator(math.fsum, n_specs=1)
+        >>> specs, status = simulate(np.array([[1.0, 2.0], [0.5, 0.5]]))
+        >>> specs[:, 0].tolist(), status.tolist()
+        ([3.0, 1.0], [0, 0])
     """
 
     function: Callable[[np.ndarray], Any]

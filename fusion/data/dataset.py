@@ -32,6 +32,12 @@ class Dataset:
         split: how test rows were taken: `subject`, `trip` or `random`.
         scale: training minimum and maximum of each channel, in the units of the file.
         source: name of the file or folder that was read.
+
+    Example:
+        >>> from fusion.data import load
+        >>> data = load("simulated")
+        >>> data.n_channels, data.train_x.shape[1:] == (data.n_channels, data.n_time)
+        (6, True)
     """
 
     name: str

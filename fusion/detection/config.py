@@ -92,6 +92,13 @@ class DetectorConfig:
             the targets see how far their mean lies above its running mean for the view, in frames
             with positives; else class losses are means over the mini-batch and the targets see the
             whole losses of the paths.
+
+    Raises:
+        ValueError: what cannot be built, by name and value.
+
+    Example:
+        >>> DetectorConfig(model="avod").rpn_crop
+        3
     """
 
     model: DetectorModel = "avod_argate"

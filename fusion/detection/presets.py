@@ -100,6 +100,9 @@ def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
             for tests.
         model: `avod`, `avod_argate`, `dense` or `dense_argate`.
 
+    Returns:
+        DetectorSetup: config, train, params.
+
     Raises:
         ValueError: unknown size or model.
 

@@ -45,6 +45,13 @@ class CategoricalConfig:
         missing_value: an integer outside the categories that stands for a missing input, with a
             learned output of its own.
         n_iterations: passes of Dykstra's algorithm where pairs share categories.
+
+    Raises:
+        ValueError, TypeError: sizes, ranges or orders that mean nothing, by name and value.
+
+    Example:
+        >>> CategoricalConfig(3, order=((0, 1), (1, 2))).n_categories
+        3
     """
 
     n_categories: int

@@ -57,6 +57,9 @@ class DeepLatticeConfig:
         output_range: `(low, high)` of the output, either of which may be `None`.
         interpolation: of the lattices.
         n_iterations: Dykstra passes for each lattice with several monotone axes.
+
+    Raises:
+        ValueError, TypeError: sizes, directions or ranges that mean nothing, by name and value.
     """
 
     n_inputs: int

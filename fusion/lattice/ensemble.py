@@ -76,6 +76,13 @@ class EnsembleConfig:
         output_range: `(low, high)`, either of which may be `None`.
         interpolation: "hypercube" or "simplex".
         n_iterations: passes of Dykstra's algorithm.
+
+    Raises:
+        ValueError, TypeError: subsets or directions that mean nothing, by name and value.
+
+    Example:
+        >>> EnsembleConfig(4, features=((0, 1), (2, 3)), monotonicity=(1, 0, 0, 0)).lattice_size
+        2
     """
 
     n_inputs: int

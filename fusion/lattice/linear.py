@@ -58,6 +58,13 @@ class LinearConfig:
         connected: 0/1 for each output and input; weights at 0 are held at zero.
         bias: add a learned constant to each output.
         n_iterations: passes of Dykstra's algorithm, where the constraints need it.
+
+    Raises:
+        ValueError, TypeError: sizes, directions or pairs that mean nothing, by name and value.
+
+    Example:
+        >>> LinearConfig(3, monotonicity=(1, 1, 0), dominance=((0, 1),)).n_outputs
+        1
     """
 
     n_inputs: int

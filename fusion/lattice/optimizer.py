@@ -39,6 +39,9 @@ def with_projection(
     Returns:
         The optax transformation; `update` needs `params`.
 
+    Raises:
+        ValueError: `update` is called without `params`.
+
     Source: projected (sub)gradient methods, e.g. Bertsekas (1999), Nonlinear programming,
     section 2.3; with an adaptive optimizer as in Gupta et al. (2016).
 

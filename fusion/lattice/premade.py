@@ -39,6 +39,13 @@ class Feature:
         keypoints: positions of the calibrator's keypoints; numbers only.
         n_categories: categories `0..n_categories - 1`; None for a number.
         order: pairs `(low, high)` of categories whose outputs are ordered.
+
+    Raises:
+        ValueError, TypeError: directions of categories, or orders of numbers.
+
+    Example:
+        >>> Feature("age", monotonicity=1).n_categories is None
+        True
     """
 
     name: str

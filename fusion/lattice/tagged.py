@@ -155,6 +155,14 @@ def project_tree(params: Any) -> Any:
 
     Raises:
         ValueError: the tree holds no tagged layer, or a mask hides half of one.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from fusion.lattice.linear import LinearConfig, LinearParams
+        >>> config = LinearConfig(2, monotonicity=(1, 1))
+        >>> layer = tag(config, LinearParams(jnp.array([[-1.0, 2.0]])))
+        >>> float(check_tree({"first": layer})), float(check_tree(project_tree({"first": layer})))
+        (1.0, 0.0)
     """
 
     def one(node: Any) -> Any:
@@ -180,6 +188,14 @@ def check_tree(params: Any) -> Float[Array, ""]:
 
     Raises:
         ValueError: as for `project_tree`.
+
+    Example:
+        >>> import jax.numpy as jnp
+        >>> from fusion.lattice.linear import LinearConfig, LinearParams
+        >>> config = LinearConfig(2, monotonicity=(1, 1))
+        >>> layer = tag(config, LinearParams(jnp.array([[-1.0, 2.0]])))
+        >>> float(check_tree([layer, "anything else"]))
+        1.0
     """
     _require_tags(params)
     worst = jnp.zeros(())

@@ -41,6 +41,16 @@ def run_command(
         SystemExit: 2 after bad input, 1 after failed or missing work (`main` returned a true
             `failed` or `missing`, or raised :class:`WorkFailedError`), 130 after Ctrl-C. A command
             that returns has worked.
+
+    Example:
+        >>> import dataclasses
+        >>> @dataclasses.dataclass(frozen=True)
+        ... class Config:
+        ...     n: int = 3
+        >>> def main(config: Config) -> dict[str, int]:
+        ...     return {"sum": sum(range(config.n))}
+        >>> run_command(Config, main, description=None, fields=dict, argv=[])
+        result: sum=3
     """
     import tyro
 

@@ -71,7 +71,15 @@ def write_text(path: Path, text: str) -> None:
 
 
 def write_json(path: Path, value: Any) -> None:
-    """Write `value` as indented JSON, atomically."""
+    """Write `value` as indented JSON, atomically.
+
+    Example:
+        >>> import tempfile
+        >>> path = Path(tempfile.mkdtemp()) / "found.json"
+        >>> write_json(path, {"rate": float("nan"), "n": 2})
+        >>> json.loads(path.read_text(encoding="utf-8"))
+        {'rate': None, 'n': 2}
+    """
     write_text(path, json.dumps(to_jsonable(value), indent=1, allow_nan=False) + "\n")
 
 

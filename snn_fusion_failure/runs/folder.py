@@ -29,6 +29,15 @@ def open_run(
 
     Raises:
         ValueError: `out` holds another run, or the settings of the run to resume differ.
+
+    Example:
+        >>> import tempfile
+        >>> folder = Path(tempfile.mkdtemp()) / "mine"
+        >>> open_run(folder, {"seed": 0}), open_run(folder, {"seed": 0}, resume=True)
+        ({'seed': 0}, {'seed': 0})
+        >>> open_run(folder, {"seed": 1}, resume=True)  # doctest: +ELLIPSIS
+        Traceback (most recent call last):
+        ValueError: ... holds a run with other settings (seed: 0 -> 1)...
     """
     wanted = to_jsonable(settings)
     config = out / "config.json"

@@ -82,6 +82,9 @@ class Axis(NamedTuple):
 def grid(*values: float) -> Axis:
     """These numbers, every one of them, each with all values of the other axes.
 
+    Returns:
+        The axis, to stand in a space under the name of a constant.
+
     Example:
         >>> grid(5, 25, 100).values
         (5.0, 25.0, 100.0)
@@ -96,8 +99,15 @@ def grid(*values: float) -> Axis:
 def uniform(low: float, high: float) -> Axis:
     """Numbers of a range, drawn evenly.
 
+    Returns:
+        The axis, to stand in a space under the name of a constant.
+
     Raises:
         ValueError: `low` is not below `high`.
+
+    Example:
+        >>> [float(v) for v in uniform(-1.0, 1.0).at(np.array([0.0, 0.5]))]
+        [-1.0, 0.0]
     """
     return _checked(Axis(low=float(low), high=float(high)))
 
@@ -105,8 +115,15 @@ def uniform(low: float, high: float) -> Axis:
 def loguniform(low: float, high: float) -> Axis:
     """Numbers of a range, drawn evenly in the logarithm.
 
+    Returns:
+        The axis, to stand in a space under the name of a constant.
+
     Raises:
         ValueError: `low` is not below `high`, or not above 0.
+
+    Example:
+        >>> [round(v, 6) for v in loguniform(1e-4, 1e-2).at(np.array([0.0, 0.5]))]
+        [0.0001, 0.001]
     """
     return _checked(Axis(low=float(low), high=float(high), log=True))
 
@@ -114,8 +131,15 @@ def loguniform(low: float, high: float) -> Axis:
 def integers(low: int, high: int) -> Axis:
     """Whole numbers from `low` to `high`, both included; traced, so none compiles anew.
 
+    Returns:
+        The axis, to stand in a space under the name of a constant.
+
     Raises:
         ValueError: `low` is not below `high`.
+
+    Example:
+        >>> integers(1, 6).kind, integers(1, 6).ranges
+        ('int', True)
     """
     return _checked(Axis(kind="int", low=int(low), high=int(high)))
 
@@ -126,8 +150,15 @@ def choice(*values: Any) -> Axis:
     Each compiles a program of its own, once; for numbers that need not be known when the program
     is compiled `grid` is cheaper.
 
+    Returns:
+        The axis, to stand in a space under the name of a constant.
+
     Raises:
         ValueError: no value, a value twice, or one that JSON cannot hold.
+
+    Example:
+        >>> choice(32, 64).kind
+        'static'
     """
     return _checked(Axis(kind="static", values=tuple(values)))
 
@@ -135,8 +166,15 @@ def choice(*values: Any) -> Axis:
 def categorical(*labels: Any) -> Axis:
     """Labels of which the trial gets the number, traced (for `jax.lax.switch`).
 
+    Returns:
+        The axis, to stand in a space under the name of a constant.
+
     Raises:
         ValueError: no label, a label twice, or one that JSON cannot hold.
+
+    Example:
+        >>> categorical("softmax", "sparse").kind
+        'category'
     """
     return _checked(Axis(kind="category", values=tuple(labels)))
 

@@ -27,7 +27,15 @@ STUDIES = {
 
 @dataclasses.dataclass(frozen=True)
 class Metric:
-    """One number per trial."""
+    """One number per trial.
+
+    Raises:
+        ValueError: a goal that is none.
+
+    Example:
+        >>> Metric("%", "share of trials that arrive", "max").goal
+        'max'
+    """
 
     unit: str = ""
     text: str = ""
@@ -53,6 +61,10 @@ class Carry:
         total: the budget of a whole trial.
         objective: what settings are ranked by before the end, and the only metric that has to be a
             number there; the study's own when left out.
+
+    Example:
+        >>> Carry(lambda p, k: p, lambda p, k, c, begin, end: (c, {"spread": c}), total=8).total
+        8
     """
 
     init: Callable[[Any, Any], Any]
@@ -82,6 +94,15 @@ class Study:
         carry: how a cut trial is gone on with; None where it starts anew.
         variant: the study with other options, for static axes; None where it has none.
         source: what its fingerprint starts from: a function or a module's name.
+
+    Raises:
+        ValueError: an objective that is not among the metrics, or that has no direction.
+
+    Example:
+        >>> metrics = {"x": Metric(goal="min")}
+        >>> study = Study("mine", {}, (1.0,), lambda p, keys: {"x": p[0]}, metrics, "x")
+        >>> study.dtype
+        'float32'
     """
 
     name: str

@@ -117,6 +117,9 @@ def read_frame(
         part: `training` or `testing`.
         any_size: accept images of other sizes than the benchmark's.
 
+    Returns:
+        Frame: picture, points, calibration, labels and plane (the last two where there are any).
+
     Raises:
         FileNotFoundError: image, scan or calibration is missing, or labels of a training frame.
         ValueError: one of the files is damaged.

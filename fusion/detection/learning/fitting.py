@@ -118,6 +118,9 @@ def fit_detector(
             step and an interrupt save too.
         resume: go on from the newest checkpoint.
 
+    Returns:
+        The state after the last step and the reported means.
+
     Raises:
         ValueError: checkpoints are there and `resume` is not set, or there are no frames.
         TrainingDiverged: the loss is not finite; the checkpoint before it is kept.
@@ -218,6 +221,9 @@ def run_detector(
         failure: of `SENSOR_FAILURES`, the failure of one sensor in every frame; None for none.
         severity: of the failure; seed: of its noise, which depends on the frame's position too.
         on_frame: called with the number of frames done.
+
+    Returns:
+        One `Detections` per frame, in order.
     """
     # Models with and without a gate read the same inputs.
     plain = dataclasses.replace(config, model="dense" if config.is_dense else "avod")

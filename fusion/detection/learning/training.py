@@ -52,6 +52,13 @@ class DetectorTrainConfig:
             a third clean in its other experiments.
         severity: least severity of these failures; drawn evenly up to 1.
         failure_kinds: of `SENSOR_FAILURES`, which ones training sees.
+
+    Raises:
+        ValueError: counts, shares or names out of range.
+
+    Example:
+        >>> DetectorTrainConfig(steps=100, schedule="cosine").batch_size
+        1
     """
 
     steps: int = 120_000

@@ -145,6 +145,9 @@ def camera_failure(
         depth: `[h, w]` distance of what each pixel shows [m], inf for sky; fog alone uses it and
             needs it, see `depth_image`.
 
+    Returns:
+        `[h, w, 3]` in [0, 1].
+
     Raises:
         ValueError: unknown kind (the message lists the known ones), severity outside [0, 1], or fog
             without depth.

@@ -37,12 +37,10 @@ class NetworkConfig:
         group_exc, group_inh: input neurons of each kind per group.
         dt: step [s].
         control_steps: steps the network runs per control step of the robot; open in the source.
-        hold_steps: steps for which weights are held before a reward changes them; divides
-            `control_steps`; 1 is the definition.
+        hold_steps: steps between changes of weights; divides `control_steps`; 1 by definition.
         bounds: "hard" (the source) or "soft".
-        w_max_split: which half of the first layer's synapses of the proposed network has the lower
-            bound: those onto inhibitory hidden neurons ("post") or from inhibitory inputs ("pre");
-            the source only says "half".
+        w_max_split: the half of the first layer's synapses with the lower bound: those onto
+            inhibitory neurons ("post") or from inhibitory inputs ("pre"); the source says "half".
         angle_code: order of the rates of the angle's intervals, see `encoding.ANGLE_CODES`.
         reward_timing: the reward of a control step comes from the reading that the network saw
             ("before") or from the one after the move ("after").

@@ -245,6 +245,19 @@ def test_without_hard_links_one_writer_still_wins(tmp_path, monkeypatch) -> None
     assert files.create_once(tmp_path / "other.json", "x")
 
 
+def test_with_hard_links_the_later_of_two_writers_is_told_so(tmp_path, monkeypatch) -> None:
+    """The other one's file appears between the look and the link."""
+    path, link = tmp_path / "sweep.json", os.link
+
+    def late(source: Any, target: Any) -> None:
+        Path(target).write_text("theirs")
+        link(source, target)
+
+    monkeypatch.setattr(os, "link", late)
+    assert files.create_once(path, "mine") is False
+    assert path.read_text() == "theirs" and len(list(tmp_path.iterdir())) == 1
+
+
 def test_a_sweep_runs_where_there_are_no_hard_links(whole, tmp_path, monkeypatch) -> None:
     monkeypatch.setattr(os, "link", _no_link)
     same(run(tmp_path), whole, *VARIABLES)

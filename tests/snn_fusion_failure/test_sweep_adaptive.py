@@ -6,12 +6,15 @@ import dataclasses
 import itertools
 import json
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
+import jax.numpy as jnp
 import numpy as np
 import pytest
 import xarray as xr
 
+from failure import circuits
 from snn_fusion_failure.commands import sweep
 from snn_fusion_failure.sweeps import definition, plan, rungs
 from snn_fusion_failure.sweeps.program import compile_study
@@ -127,6 +130,19 @@ def test_asha_promotes_the_best_share_of_what_is_done() -> None:
     assert rungs.promotions(np.full(4, -np.inf), np.ones(4, bool), 0.5).tolist() == []
 
 
+class Formula:
+    """A circuit that compiles at once: the search around it is what is tested."""
+
+    n_dims = 3
+    specs = (SimpleNamespace(unit="V", sense="max"),)
+
+    def spec_index(self, name: str) -> int:
+        return 0
+
+    def run(self, x: Any) -> Any:
+        return jnp.sin(x).sum(axis=1, keepdims=True), jnp.zeros(len(x), jnp.int32)
+
+
 @pytest.mark.slow
 @pytest.mark.relaxed
 @pytest.mark.parametrize(
@@ -137,7 +153,8 @@ def test_asha_promotes_the_best_share_of_what_is_done() -> None:
         ("snn", [*SMALL["snn"], "n_learn=3"], (0, 1, 3)),
     ],
 )
-def test_studies_go_on_from_a_carried_state(name, options, steps) -> None:
+def test_studies_go_on_from_a_carried_state(name, options, steps, monkeypatch) -> None:
+    monkeypatch.setattr(circuits, "get", lambda name: Formula())
     study = load_study(name, options)
     rng = np.random.default_rng(0)
     words = rng.integers(0, 2**32, (2, 2), np.uint32)

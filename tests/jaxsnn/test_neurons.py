@@ -119,3 +119,12 @@ def test_constants_may_be_traced():
         return lif_step(params, lif_init(params, 1), 10.0, jnp.zeros(1), dt=DT)[0].v[0]
 
     np.testing.assert_allclose(jax.vmap(run)(jnp.array([10e-3, 20e-3])), [1.0, 0.5], rtol=1e-6)
+
+
+def test_a_neuron_at_its_threshold_does_not_fire_and_one_above_does():
+    """As in Brian 2, `v > v_th`."""
+    params = LIFParams(v_rest=1.0, v_th=1.0, v_reset=0.0)
+    state = lif_init(params, 2)
+    state = state._replace(v=jnp.array([1.0, 1.5]))
+    _, spikes = lif_step(params, state, 0.0, jnp.zeros(2), dt=1e-3)
+    assert spikes.tolist() == [False, True]

@@ -117,6 +117,55 @@ def test_a_survivor_that_is_gone_on_with_has_the_numbers_of_a_whole_trial(tmp_pa
         assert any(name.startswith("carry_") for name in chunk.files)
 
 
+LATE = """
+import jax, jax.numpy as jnp
+from typing import NamedTuple
+from snn_fusion_failure.sweeps.study import Carry, Metric, Study
+
+class Params(NamedTuple):
+    a: float = 1.0
+
+def make():
+    def init(params, keys):
+        return jnp.zeros(keys.shape[0])
+
+    def advance(params, keys, carry, begin, end):
+        def step(i, total):
+            draw = jax.vmap(lambda k: jax.random.normal(jax.random.fold_in(k, i)))(keys)
+            return total + params.a + 0.01 * draw
+        total = jax.lax.fori_loop(begin, end, step, carry)
+        late = -total if end == 4 else jnp.full_like(total, jnp.nan)
+        return total, {"early": total, "late": late}
+
+    def run(params, keys):
+        return advance(params, keys, init(params, keys), 0, 4)[1]
+
+    metrics = {"early": Metric("", "", "max"), "late": Metric("", "", "max")}
+    carry = Carry(init, advance, 4, objective="early")
+    return Study("late", {}, Params(), run, metrics, "late", carry=carry)
+"""
+
+
+@pytest.mark.parametrize("mode", ["halving", "asha"])
+def test_what_is_only_known_at_the_end_does_not_break_a_trial_before(tmp_path, mode) -> None:
+    """Rungs rank by what there is; the best there is the worst by what is known at the end."""
+    path = tmp_path / "late_study.py"
+    path.write_text(LATE)
+    config = sweep.Config(
+        study=f"{path}:make", grid=("a=1,2,3,4",), seeds=2, chunk_size="2", chunk_trials=2,
+        quiet=True,
+    )  # fmt: skip
+    whole = run(config, tmp_path / "whole")
+    cut = run(config, tmp_path / "cut", **{mode: (1, 2), "keep": 0.5})
+    assert int((cut["status"] == definition.NON_FINITE).sum()) == 0
+    full = (cut["budget"] == np.iinfo(np.int32).max).values
+    assert full[3].all() and not full[:2].any()
+    last = (cut["status"] == definition.OK).values & full
+    assert np.isfinite(cut["late"].values[last]).all()
+    for name in ("early", "late"):
+        np.testing.assert_array_equal(cut[name].values[last], whole[name].values[last])
+
+
 def test_asha_promotes_before_a_rung_is_full(tmp_path) -> None:
     run(LIF, tmp_path, asha=(15, 30), keep=0.5)
     budgets = [s.budget for s in plan.segments_of(plan.read_plan(tmp_path))]

@@ -7,6 +7,7 @@ import json
 import multiprocessing
 import os
 import stat
+import subprocess
 import sys
 import threading
 import time
@@ -356,7 +357,9 @@ def test_a_silent_holder_loses_its_lease(tmp_path) -> None:
     assert mine is not None and leases.take(tmp_path, "x", 60.0) is None
     mine._stop.set()  # as if on a machine that has vanished
     about = json.loads(mine.path.read_text())
-    mine.path.write_text(json.dumps(about | {"machine": "elsewhere"}))
+    ended = subprocess.Popen([sys.executable, "-c", ""])
+    ended.wait()  # a number that no process here has says nothing about another machine
+    mine.path.write_text(json.dumps(about | {"machine": "elsewhere", "pid": ended.pid}))
     assert leases.take(tmp_path, "x", 60.0) is None  # its last sign of life is recent
     os.utime(mine.path, (1, 1))
     theirs = leases.take(tmp_path, "x", 60.0)

@@ -236,7 +236,7 @@ def test_every_run_has_a_file_and_a_number_of_the_source() -> None:
         assert [row.name for row in rows] == list(source[table]["rows"])
         paths += [run.path(Path()) for run in fusion_tables.runs(table, 2)]
     # Rows x models and references, for two seeds.
-    assert len(set(paths)) == len(paths) == 2 * (55 + 10 + 15 + 12 + 66 + 5)
+    assert len(set(paths)) == len(paths) == 2 * (55 + 10 + 15 + 12 + 63 + 5)
 
 
 def test_a_table_pairs_runs_by_seed(tmp_path: Path) -> None:

@@ -77,8 +77,11 @@ def main(config: Config) -> dict[str, Any]:
         ValueError: the interpreter is not there, or a requirement has no lower bound.
     """
     interpreter = shutil.which(config.python)
-    if interpreter is None:
-        raise ValueError(f"python={config.python!r}: expected an interpreter; install it first")
+    # A version manager leaves names on the PATH that lead to no interpreter.
+    if interpreter is None or subprocess.run([interpreter, "-c", ""], check=False).returncode:
+        raise ValueError(
+            f"python={config.python!r}: expected an interpreter; install it or give its path"
+        )
     text = (repository.ROOT / "pyproject.toml").read_text(encoding="utf-8")
     pinned = lowest(tomllib.loads(text)["project"])
     with tempfile.TemporaryDirectory(prefix="lowest-") as temporary:

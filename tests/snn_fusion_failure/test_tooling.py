@@ -38,6 +38,15 @@ def test_constraints_pin_every_requirement_above_its_bound() -> None:
         assert numbers(held[name]) >= numbers(bound), name
 
 
+def test_another_python_has_to_be_there(tmp_path: Path) -> None:
+    broken = tmp_path / "python9"
+    broken.write_text("#!/bin/sh\nexit 127\n", encoding="utf-8")
+    broken.chmod(0o755)
+    for name in ("python0.1", str(broken)):
+        with pytest.raises(ValueError, match="expected an interpreter; install it"):
+            lowest.main(lowest.Config(python=name))
+
+
 class Item:
     def __init__(self, nodeid: str, slow: bool) -> None:
         self.nodeid, self.slow = nodeid, slow

@@ -86,7 +86,7 @@ class _Process:
                 f"function={self._function!r}: expected a top-level function of a module that a "
                 "new process can import"
             )
-        self._group.adopt(process.pid)
+        self._group.adopt(self._process.pid)
 
     def _stop(self) -> None:
         if self._process is not None:

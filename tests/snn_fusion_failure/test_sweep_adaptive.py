@@ -213,7 +213,9 @@ def test_studies_go_on_from_a_carried_state(name, options, steps, monkeypatch) -
     for span in itertools.pairwise(steps):
         parts, carry = compile_study(study, root=0, width=2, span=span)({}, words, seeds, carry)
     for metric in study.metrics:
-        np.testing.assert_array_equal(parts[metric], whole[metric], err_msg=metric)
+        # The loss of `argate` is a float32 that the compiler rounds otherwise in another program.
+        rtol = 1e-6 if metric == "loss" else 0.0
+        np.testing.assert_allclose(parts[metric], whole[metric], rtol, atol=0.0, err_msg=metric)
 
 
 def test_a_plan_is_a_record_of_what_was_asked_for(tmp_path) -> None:

@@ -91,7 +91,7 @@ def test_who_goes_on() -> None:
     assert survivors(scores, 0.25).tolist() == [1]  # the earlier of two that are alike
     assert survivors(scores, 0.5).tolist() == [1, 2]
     assert survivors(scores, 0.01).tolist() == [1]  # always one
-    assert survivors(np.array([5.0, 1.0, 2.0, 3.0]), 0.5).tolist() == [0, 3]
+    assert survivors(np.array([5.0, 4.0, 1.0, 2.0]), 0.5).tolist() == [0, 1]
     assert survivors(np.full(8, -np.inf), 0.1).tolist() == [0]
     broken = np.array([-np.inf, 5.0, -np.inf, -np.inf])
     assert promotions(broken, np.ones(4, bool), 0.5).tolist() == [1]

@@ -48,25 +48,18 @@ def make(
     def advance(params: Any, key: Any, state: Any, begin: int, end: int) -> Any:
         """Epochs `begin` to `end - 1` of `fusion.train.make_train`, then the score."""
 
-        # Hidden from the compiler: it treats a loop that it knows to run once differently, and the
-        # last bits of a training in parts would not be those of a training in one go.
-        bounds = jax.lax.optimization_barrier(jnp.asarray([begin, end], jnp.int32))
-
-        def body(carry: Any) -> Any:
-            index, state, _ = carry
+        def body(state: Any, index: Any) -> Any:
             draw = jax.random.fold_in(jax.random.fold_in(key, 2), index)
             noisy, failed = failures.corrupt(protocol, train_x, kind, key=draw)
             step_key = jax.random.fold_in(jax.random.fold_in(key, 1), index)
-            state, metrics = epoch(params, state, noisy, train_y, failed, key=step_key)
-            return index + 1, state, metrics.loss.total
+            return epoch(params, state, noisy, train_y, failed, key=step_key)
 
-        _, state, loss = jax.lax.while_loop(
-            lambda carry: carry[0] < bounds[1], body, (bounds[0], state, jnp.zeros(()))
-        )
+        state, metrics = jax.lax.scan(body, state, jnp.arange(begin, end))
         x, failed = failures.corrupt(protocol, score_x, kind, key=jax.random.fold_in(key, 3))
         logits, _ = predict_batches(config, export(state.params), x, failed)
         hit = (jnp.argmax(logits, -1) == score_y).astype(jnp.float32)
         broken = jnp.any(failed, axis=1)
+        loss = metrics.loss.total[-1]
         # Without a finite loss the accuracy of what is left means nothing.
         valid = jnp.where(jnp.isfinite(loss), 1.0, jnp.nan)
         return state, {

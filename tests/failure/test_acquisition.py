@@ -121,3 +121,15 @@ def test_bad_configurations():
         acquisition.AcquisitionConfig(batch_size=4)
     with pytest.raises(ValueError, match="n_restarts=9"):
         acquisition.AcquisitionConfig(n_raw=8, n_restarts=9)
+
+
+@pytest.mark.parametrize(
+    ("mean", "sd", "best"), [(1.0, 2.0, 0.5), (-1.0, 0.25, 0.5), (3.0, 0.1, 3.0)]
+)
+def test_log_ei_is_the_logarithm_of_the_closed_form(mean, sd, best):
+    z = (mean - best) / sd
+    density = np.exp(-0.5 * z * z) / np.sqrt(2.0 * np.pi)
+    wanted = np.log((mean - best) * special.ndtr(z) + sd * density)
+    with jax.enable_x64(True):
+        got = acquisition.log_ei(jnp.asarray(mean), jnp.asarray(sd), jnp.asarray(best))
+    np.testing.assert_allclose(got, wanted, rtol=1e-9)

@@ -21,7 +21,7 @@ pytestmark = pytest.mark.relaxed
 def shown(tmp_path_factory: pytest.TempPathFactory) -> tuple[Path, dict]:
     folder = tmp_path_factory.mktemp("watch")
     config = watch_sensors.Config(
-        preset="quick", samples=80, save=folder / "net.npz", picture=folder / "watch.gif"
+        preset="quick", samples=44, save=folder / "net.npz", picture=folder / "watch.gif"
     )
     return folder, watch_sensors.main(config)
 

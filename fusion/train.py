@@ -7,7 +7,7 @@ around them: corruption, checkpoints, resume, and a clear stop on a loss that is
 from __future__ import annotations
 
 from collections.abc import Callable
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -149,7 +149,8 @@ def train_step(
         gain = jax.random.normal(jax.random.fold_in(key, 100), x.shape[:2])
         x = x * (1.0 + config.jitter * gain)[:, :, None]
 
-    trained, seen, excluded = _without_memory(state.params), {}, None
+    seen: dict[str, Any] = {}
+    trained, excluded = _without_memory(state.params), None
     if "memory" in state.params:
         seen, number = recall(
             model.memory_rows, state.params["memory"], key=jax.random.fold_in(key, 101)

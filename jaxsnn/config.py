@@ -93,7 +93,7 @@ class NetworkConfig:
             f"hold_steps={self.hold_steps}: expected a divisor of control_steps = "
             f"{self.control_steps}; choose one",
         )
-        choices: dict[str, tuple[str, ...]] = {
+        choices: dict[str, tuple[Any, ...]] = {
             "rule": ("additive", "multiplicative"),
             "encoding": ("reference", "proposed"),
             "bounds": ("hard", "soft"),

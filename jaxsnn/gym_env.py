@@ -141,8 +141,8 @@ class RobotVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         self, actions: np.ndarray
     ) -> tuple[np.ndarray, np.ndarray, np.ndarray, np.ndarray, dict[str, Any]]:
         """One control step of all robots; one that has ended begins its next episode."""
-        actions = jnp.asarray(actions, jnp.float32)
-        made = self._advance(self._state, self._ended, actions, self._keys())
+        given = jnp.asarray(actions, jnp.float32)
+        made = self._advance(self._state, self._ended, given, self._keys())
         self._state, self._ended = made.state, made.terminated | made.truncated
         info = {name: np.asarray(value) for name, value in _info(made).items()}
         flags = np.asarray(made.terminated), np.asarray(made.truncated)

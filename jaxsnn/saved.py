@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -31,7 +32,9 @@ def save_networks(path: str | Path, config: NetworkConfig, states: NetworkState)
         raise ValueError(f"save={path}: expected a name that ends in .npz; rename it")
     path.parent.mkdir(parents=True, exist_ok=True)
     kept = (states.weights, states.baseline_input, states.baseline_hidden, states.updates)
-    arrays = {f"leaf_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(kept))}
+    arrays: dict[str, Any] = {
+        f"leaf_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(kept))
+    }
     text = json.dumps(dataclasses.asdict(config))
     with path.open("wb") as file:
         np.savez(file, config=np.asarray(text), **arrays)

@@ -41,7 +41,8 @@ def near_interval(sonar: Float[Array, "*n"]) -> Int[Array, "*n"]:
         >>> near_interval(jnp.array([49.0, 50.0, 100.0, 300.0])).tolist()
         [0, 1, 2, 3]
     """
-    return sum((sonar >= bound).astype(jnp.int32) for bound in (50.0, 100.0, 200.0))
+    bounds = (50.0, 100.0, 200.0)
+    return sum(((sonar >= bound).astype(jnp.int32) for bound in bounds), jnp.int32(0))
 
 
 def angle_octant(angle: Float[Array, "*n"]) -> Int[Array, "*n"]:

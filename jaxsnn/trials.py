@@ -111,8 +111,8 @@ def _advance(
     begin = _start(key, following_trial, map, circles, n_trials, first)
     robot = jax.tree.map(lambda a, b: jnp.where(begins, a, b), begin, moved)
     if poses is not None:
-        first = jnp.where(begins, following_trial, n_trials)
-        poses = poses.at[first, 0].set(_pose(begin), mode="drop")
+        row = jnp.where(begins, following_trial, n_trials)
+        poses = poses.at[row, 0].set(_pose(begin), mode="drop")
     result = TrialResult(
         status=result.status.at[at].set(status, mode="drop"),
         steps=result.steps.at[at].add(1, mode="drop"),

@@ -54,13 +54,13 @@ def load_file(path: str | Path, *, seed: int = 0) -> Dataset:
             f"{'add ' + ', '.join(missing) if missing else 'rename ' + ', '.join(unknown)}"
         )
     x = arrays.pop("x")
-    names = {n: [str(v) for v in arrays.pop(n)] for n in ("channels", "classes") if n in arrays}
+    given = {n: [str(v) for v in arrays.pop(n)] for n in ("channels", "classes") if n in arrays}
     return from_arrays(
         x[:, :, None] if x.ndim == 2 else x,
         arrays["y"],
         groups=arrays.get("groups"),
-        channels=names.get("channels"),
-        classes=names.get("classes"),
+        channels=given.get("channels"),
+        classes=given.get("classes"),
         seed=seed,
     )
 

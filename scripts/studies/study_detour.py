@@ -33,7 +33,13 @@ NETWORKS = ("S1", "S2", "S3", "S4", "S4_literal", "S4_guided", "S3_guided")
 LEARNERS = ("q_learning", "ppo")
 FAMILY = ROWS[-1]
 UNITS = {"path_ratio": "1"}
-PPO = {"n_envs": 32, "n_steps": 128, "n_updates": 100, "n_minibatches": 8, "initial_std": 0.8}
+PPO: dict[str, Any] = {
+    "n_envs": 32,
+    "n_steps": 128,
+    "n_updates": 100,
+    "n_minibatches": 8,
+    "initial_std": 0.8,
+}
 PPO_PARAMS = {"learning_rate": 1e-3}
 TITLE = "Drivers and learners on maps that need a detour"
 

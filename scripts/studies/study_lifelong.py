@@ -112,7 +112,7 @@ def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
     def run(words: Any, params: Any, changed: Any, before: Any, after: Any) -> Any:
         keys = jax.random.wrap_key_data(words)
         constants = agents.snn_params(network, params), agents.snn_params(network, changed)
-        options = {"n_learn": n, "n_test": n, "max_steps": config.max_steps,
+        options: dict[str, Any] = {"n_learn": n, "n_test": n, "max_steps": config.max_steps,
                    "block": config.block, "keep_states": True}  # fmt: skip
         first = run_experiment(network, constants[0], before, keys=keys, **options)
         later = jax.vmap(lambda k: jax.random.fold_in(k, 1))(keys)

@@ -4,8 +4,7 @@ The names listed below are the public ones; the rest of the package may change.
 
 - Kernels: `LIFParams` and `lif_init`, `lif_step`, `lif_scan`; `STDPParams` and `stdp_init`,
   `stdp_step`, or `stdp_kernel`, `stdp_window`; `apply_reward`, `poisson_spikes`.
-- Networks that steer: `preset`, `snn_params`, `snn_agent`, or an `Agent` of one's own from
-  `reinforce` and `terminal_reward`.
+- Networks that steer: `preset`, `snn_params`, `snn_agent`, or an `Agent` of one's own.
 - The robot's world: `scenario`, `detour`, `make_map`, `random_map`; `world.reset`, `world.observe`
   and `world.step` move one robot; `drive` for drivers that do not learn.
 - Trials: `run_experiment`, `run_phase`, `success_rate`, `Status`.
@@ -21,11 +20,9 @@ from jaxsnn.drivers import drive
 from jaxsnn.encoding import poisson_spikes
 from jaxsnn.experiment import run_experiment
 from jaxsnn.maps import make_map, random_map
-from jaxsnn.network import reinforce
 from jaxsnn.neurons import LIFParams, lif_init, lif_scan, lif_step
 from jaxsnn.plasticity import STDPParams, apply_reward, stdp_init, stdp_step
 from jaxsnn.presets import preset
-from jaxsnn.rewards import terminal_reward
 from jaxsnn.scenarios import detour, scenario
 from jaxsnn.status import Status
 from jaxsnn.trials import run_phase, success_rate
@@ -50,7 +47,6 @@ __all__ = [
     "poisson_spikes",
     "preset",
     "random_map",
-    "reinforce",
     "run_experiment",
     "run_phase",
     "scenario",
@@ -61,6 +57,5 @@ __all__ = [
     "stdp_step",
     "stdp_window",
     "success_rate",
-    "terminal_reward",
     "world",
 ]

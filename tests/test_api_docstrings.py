@@ -23,7 +23,6 @@ CODE = "\n".join(
 """The Python blocks that test_docs.py and test_readme.py execute."""
 
 NO_EXAMPLE = {
-    "jaxsnn.run_experiment": "compiles for half a minute; tests/jaxsnn/test_trials.py calls it",
     "fusion.detection.evaluate": "reads frames; tests/fusion/test_detection_evaluate.py calls it",
     "fusion.detection.fit_detector": "trains; tests/fusion/test_detection_script.py calls it",
     "fusion.detection.make_example": "reads a frame; tests/fusion/test_detection_network.py calls it",

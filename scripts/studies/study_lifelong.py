@@ -19,15 +19,12 @@ import json
 import time
 from typing import Any
 
-import tyro
-
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
-    fail,
-    print_result,
     progress,
     repository,
+    run_command,
 )
 from snn_fusion_failure.runs.origin import check_recordable
 
@@ -163,9 +160,10 @@ def main(config: Study) -> dict[str, float]:
     return found
 
 
+def fields(done: dict[str, float]) -> dict[str, Any]:
+    """What the result line says."""
+    return {"cells": len(done), "file": "results/study_lifelong.json"}
+
+
 if __name__ == "__main__":
-    try:
-        done = main(tyro.cli(Study, description=__doc__))
-    except ValueError as error:
-        fail(str(error))
-    print_result(cells=len(done), file="results/study_lifelong.json")
+    run_command(Study, main, description=__doc__, fields=fields)

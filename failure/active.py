@@ -10,7 +10,8 @@ import numpy as np
 from jaxtyping import Array, Float
 
 from failure import revnet
-from failure.rev_argate import RevArgateConfig, RevArgateParams, active_features, fusion_weights
+from failure.feature_ranking import active_features
+from failure.rev_argate import RevArgateConfig, RevArgateParams, fusion_weights
 
 
 class Activity(NamedTuple):
@@ -50,7 +51,7 @@ def activity(
         config: of the trained network.
         params: its weights.
         x: inputs, unit variance.
-        share: rule of the active features, see `failure.rev_argate.active_features`.
+        share: rule of the active features, see `failure.feature_ranking.active_features`.
         rows: rows that the Jacobian is averaged over.
 
     Returns:

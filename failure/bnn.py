@@ -9,7 +9,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
-from jaxtyping import Array, Float, Int, Key
+from jaxtyping import Array, Float, Key
 
 
 @dataclass(frozen=True)
@@ -66,20 +66,13 @@ class BNNParams(NamedTuple):
     y_scale: Array
 
 
-class LinearPosterior(NamedTuple):
-    """Conjugate linear regression: `mean [i+1, o]`, `covariance [i+1, i+1]`, noise `[o]`."""
-
-    mean: Array
-    covariance: Array
-    noise_variance: Array
-
-
 def _moments(x: Array) -> tuple[Array, Array]:
     mean, sd = jnp.mean(x, 0), jnp.std(x, 0)
     return mean, jnp.where(sd > 1e-6 * jnp.abs(mean), sd, jnp.ones_like(sd))
 
 
-def _check(x: Array, y: Array) -> None:
+def check_rows(x: Array, y: Array) -> None:
+    """Refuse inputs and outputs of different or too few rows."""
     if x.shape[0] != y.shape[0] or x.shape[0] < 2:
         raise ValueError(
             f"x has {x.shape[0]} rows and y {y.shape[0]}: expected the same number, at least 2"
@@ -94,7 +87,7 @@ def init(
     y: Float[Array, "m o"],
 ) -> BNNParams:
     """Initial posterior: small random means, narrow spread, moments of the data."""
-    _check(x, y)
+    check_rows(x, y)
     n_in, n_out, h = x.shape[1], y.shape[1], config.hidden
     key1, key2 = jax.random.split(key)
     weights = (
@@ -253,75 +246,3 @@ def predict(params: BNNParams, x: Float[Array, "n i"]) -> Float[Array, "n o"]:
     scaled = (x - params.x_shift[None]) / params.x_scale[None]
     out = jnp.tanh(scaled @ w1 + b1[None]) @ w2 + b2[None]
     return out * params.y_scale[None] + params.y_shift[None]
-
-
-def _design(x: Array) -> Array:
-    return jnp.concatenate([x, jnp.ones((x.shape[0], 1), x.dtype)], 1)
-
-
-def fit_linear(
-    x: Float[Array, "n i"],
-    y: Float[Array, "m o"],
-    *,
-    prior_variance: float = 1.0,
-    iterations: Int[Array, ""] | int = 20,
-) -> LinearPosterior:
-    r"""Conjugate Bayesian linear regression with the noise set by evidence iterations.
-
-    .. math::
-        S = (\Phi^\top \Phi / \sigma^2 + I / \tau^2)^{-1}, \qquad M = S \Phi^\top Y / \sigma^2
-
-    one noise level per output for reporting; the covariance uses their mean.
-
-    Args:
-        x: inputs.
-        y: targets.
-        prior_variance: :math:`\tau^2`.
-        iterations: updates of :math:`\sigma^2` by MacKay's effective number of parameters.
-
-    Source: Bishop (2006), Equations 3.53, 3.54 and 3.95.
-    """
-    _check(x, y)
-    phi = _design(x)
-    n = phi.shape[0]
-    gram, cross = phi.T @ phi, phi.T @ y
-    values, vectors = jnp.linalg.eigh(gram)
-    values = jnp.maximum(values, 0.0)
-    rotated = vectors.T @ cross
-
-    def solve(noise: Array) -> tuple[Array, Array]:
-        shrink = 1.0 / (values + noise / prior_variance)
-        return vectors @ (shrink[:, None] * rotated), shrink
-
-    def update(_: Array, noise: Array) -> Array:
-        mean, shrink = solve(noise)
-        effective = jnp.sum(values * shrink)
-        residual = jnp.mean(jnp.sum((y - phi @ mean) ** 2, 0))
-        return jnp.maximum(residual / jnp.maximum(n - effective, 1.0), 1e-12)
-
-    noise = jax.lax.fori_loop(0, iterations, update, jnp.mean(jnp.var(y, 0)) + 1e-12)
-    mean, shrink = solve(noise)
-    covariance = noise * (vectors * shrink[None]) @ vectors.T
-    per_output = jnp.mean((y - phi @ mean) ** 2, 0)
-    return LinearPosterior(mean, covariance, per_output)
-
-
-def predict_linear(
-    posterior: LinearPosterior, x: Float[Array, "n i"]
-) -> tuple[Float[Array, "n o"], Float[Array, " n"]]:
-    """Mean and variance (noise-free) of the linear baseline (Bishop 2006, Equation 3.58)."""
-    phi = _design(x)
-    return phi @ posterior.mean, jnp.sum((phi @ posterior.covariance) * phi, 1)
-
-
-def sample_linear(
-    posterior: LinearPosterior, x: Float[Array, "n i"], n_samples: int, *, key: Key[Array, ""]
-) -> Float[Array, "s n o"]:
-    """Draw linear functions from the posterior."""
-    phi = _design(x)
-    p, n_out = posterior.mean.shape
-    eye = jnp.eye(p, dtype=phi.dtype)
-    factor = jnp.linalg.cholesky(posterior.covariance + 1e-9 * eye)
-    noise = jax.random.normal(key, (n_samples, p, n_out), phi.dtype)
-    weights = posterior.mean[None] + jnp.einsum("ij,sjo->sio", factor, noise)
-    return jnp.einsum("np,spo->sno", phi, weights)

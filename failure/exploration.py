@@ -9,7 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from failure.worst_case import Archive, Region, merge_regions, worst_case_points
+from failure.archive import Archive
+from failure.worst_case import Region, merge_regions, worst_case_points
 from failure.yields import normal_draws
 
 _PER_SPEC = 3
@@ -62,9 +63,7 @@ def explore(
             starts.append((k, point))
     if not starts:
         return list(regions)
-    found = worst_case_points(
-        archive, nominal, [k for k, _ in starts], np.array([p for _, p in starts]), reach=reach
-    )
+    found = worst_case_points(archive, [k for k, _ in starts], [p for _, p in starts], reach=reach)
     sure = [r for r in found if r.converged]
     for number, (k, point) in enumerate(starts):
         if any(r.spec == k for r in [*regions, *sure]):

@@ -8,17 +8,9 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
+from failure.descents import COSINE, GAP, Descent, by_gradients, by_values, cosine_of
 from failure.estimates import GOOD, check_threshold
 from failure.performances import Counted, Performance, Slopes
-
-COSINE = 0.99
-"""A point is a design point when its direction and the gradient there agree this well."""
-
-GAP = 0.02
-"""...and when its value is this near to the threshold, in units of its distance from nominal."""
-
-LONGEST = 2.5
-"""Longest step [sigma]: a linear prediction over more is a guess."""
 
 
 class DesignPoint(NamedTuple):
@@ -60,97 +52,6 @@ class DesignPoint(NamedTuple):
         return self.gradient / max(float(np.linalg.norm(self.gradient)), 1e-300)
 
 
-class _Search:
-    """One descent: evaluates, keeps the first failure and the best point."""
-
-    def __init__(self, counted: Counted, threshold: float, step: float) -> None:
-        self.counted, self.threshold, self.step = counted, threshold, step
-        self.first = math.nan
-        self.nominal = math.nan
-
-    def spent(self) -> int:
-        return self.counted.n_values + self.counted.n_gradients
-
-    def note(self, value: float) -> None:
-        if math.isnan(self.first) and value > self.threshold:
-            self.first = float(self.spent())
-
-    def value(self, u: np.ndarray) -> float:
-        y = float(self.counted(u[None])[0])
-        self.note(y)
-        return y
-
-    def both(self, u: np.ndarray) -> tuple[float, np.ndarray]:
-        """Value and gradient; differences where there are no gradients."""
-        if self.counted.has_slopes:
-            y, g = self.counted.slopes(u[None])
-            self.note(float(y[0]))
-            return float(y[0]), g[0]
-        y0 = self.value(u)
-        return y0, self.counted.differences(u, y0, self.step)
-
-    def scale(self) -> float:
-        """What the gap to the threshold is measured in."""
-        return max(abs(self.threshold - self.nominal), 1e-300)
-
-    def target(self, u: np.ndarray, y: float, g: np.ndarray) -> np.ndarray:
-        """Hasofer-Lind: the nearest point of the linearised boundary."""
-        return ((g @ u - (y - self.threshold)) / max(float(g @ g), 1e-300)) * g
-
-    def done(self, u: np.ndarray, y: float, g: np.ndarray) -> bool:
-        return abs(y - self.threshold) <= GAP * self.scale() and _cosine(u, g) >= COSINE
-
-
-def _cosine(a: np.ndarray, b: np.ndarray) -> float:
-    return float(a @ b / max(float(np.linalg.norm(a) * np.linalg.norm(b)), 1e-300))
-
-
-def _with_gradients(
-    s: _Search, u: np.ndarray, y: float, g: np.ndarray, iterations: int
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Improved HLRF: steps shortened until the merit of Zhang and Der Kiureghian falls."""
-    for _ in range(iterations):
-        if s.done(u, y, g) or not np.any(g):
-            break
-        move = s.target(u, y, g) - u
-        move *= min(1.0, LONGEST / max(float(np.linalg.norm(move)), 1e-300))
-        weight = 2.0 * max(float(np.linalg.norm(u)), 1.0) / float(np.linalg.norm(g))
-        merit = 0.5 * u @ u + weight * abs(y - s.threshold)
-        share, moved = 1.0, False
-        for _ in range(5):
-            trial = u + share * move
-            y_new, g_new = s.both(trial)
-            if math.isfinite(y_new):
-                moved = 0.5 * trial @ trial + weight * abs(y_new - s.threshold) < merit
-            if moved or s.done(trial, y_new, g_new):
-                u, y, g, moved = trial, y_new, g_new, True
-                break
-            share *= 0.4
-        if not moved:
-            break
-    return u, y, g
-
-
-def _with_values(
-    s: _Search, u: np.ndarray, y: float, g: np.ndarray, iterations: int
-) -> tuple[np.ndarray, float, np.ndarray]:
-    """Differences once, Broyden's update after every step; one simulation each."""
-    longest = LONGEST
-    for _ in range(iterations):
-        move = s.target(u, y, g) - u
-        length = float(np.linalg.norm(move))
-        if abs(y - s.threshold) <= GAP * s.scale() and length < 0.3:
-            break
-        move *= min(1.0, longest / max(length, 1e-300))
-        y_new = s.value(u + move)
-        if not math.isfinite(y_new):
-            longest *= 0.5
-            continue
-        g = g + ((y_new - y - g @ move) / max(float(move @ move), 1e-300)) * move
-        u, y = u + move, y_new
-    return u, y, g
-
-
 def find_design_point(
     performance: Performance,
     threshold: float,
@@ -158,9 +59,11 @@ def find_design_point(
     *,
     slopes: Slopes | None = None,
     start: Float[np.ndarray, " D"] | None = None,
+    gradient: Float[np.ndarray, " D"] | None = None,
     iterations: int = 25,
     restarts: int = 2,
     step: float = 0.3,
+    reach: float = math.inf,
     seed: int = 0,
 ) -> DesignPoint:
     r"""The most likely failure, by steps to the nearest point of the linearised boundary.
@@ -179,9 +82,11 @@ def find_design_point(
         dim: D.
         slopes: `x [n, D] -> (y [n], dy/dx [n, D])`, see `performances.slopes_by_jax`.
         start: first point; nominal without.
+        gradient: slope at the first point where it is known, which saves its differences.
         iterations: steps at most, of each start.
         restarts: further starts, normal at half a sigma, while the checks fail.
         step: of the forward differences [sigma].
+        reach: no farther out than this [sigma].
         seed: of the further starts.
 
     Returns:
@@ -202,29 +107,32 @@ def find_design_point(
     if first.shape != (dim,):
         raise ValueError(f"start.shape={first.shape}: expected ({dim},)")
     counted = Counted(performance, slopes)
-    s = _Search(counted, float(threshold), step)
+    s = Descent(counted, float(threshold), step, reach)
     rng = np.random.default_rng(seed)
     starts = [first, *(0.5 * rng.normal(size=(restarts, dim)))]
     best: tuple[float, np.ndarray, float, np.ndarray] | None = None
     for k, u in enumerate(starts):
-        y, g = s.both(u)
+        if k == 0 and gradient is not None and not counted.has_slopes:
+            y, g = s.value(u), np.array(gradient, np.float64)
+        else:
+            y, g = s.both(u)
         if k == 0:
             s.nominal = y if start is None else s.value(np.zeros(dim))
         if not math.isfinite(y):
             continue
         if counted.has_slopes:
-            u, y, g = _with_gradients(s, u, y, np.nan_to_num(g), iterations)
+            u, y, g = by_gradients(s, u, y, np.nan_to_num(g), iterations)
         else:
-            u, y, g = _with_values(s, u, y, g, iterations)
-            for _ in range(3):
+            u, y, g = by_values(s, u, y, g, iterations)
+            for _ in range(0 if s.hopeless(u, y) else 3):
                 # The slope turns on the way; taken again here it is also the check.
                 g = counted.differences(u, y, step)
                 if s.done(u, y, g):
                     break
-                u, y, g = _with_values(s, u, y, g, 8)
+                u, y, g = by_values(s, u, y, g, 8)
         g = np.nan_to_num(g)
         on = abs(y - threshold) <= GAP * s.scale()
-        score = _cosine(u, g) if on else _cosine(u, g) - 2.0
+        score = cosine_of(u, g) if on else cosine_of(u, g) - 2.0
         if best is None or score > best[0]:
             best = (score, u, y, g)
         if s.done(u, y, g):
@@ -232,8 +140,20 @@ def find_design_point(
     return _report(s, best, dim)
 
 
+def onto_boundary(
+    performance: Performance, threshold: float, x: Float[np.ndarray, " D"], *, steps: int = 5
+) -> Float[np.ndarray, " D"]:
+    """A failing point, moved towards nominal by bisection until just before it no longer fails."""
+    low, high = 0.0, 1.0
+    for _ in range(steps):
+        middle = 0.5 * (low + high)
+        value = float(np.nan_to_num(np.asarray(performance((middle * x)[None]))[0], nan=-np.inf))
+        low, high = (low, middle) if value > threshold else (middle, high)
+    return high * x
+
+
 def _report(
-    s: _Search, best: tuple[float, np.ndarray, float, np.ndarray] | None, dim: int
+    s: Descent, best: tuple[float, np.ndarray, float, np.ndarray] | None, dim: int
 ) -> DesignPoint:
     """The best end point, checked."""
     spent = (s.counted.n_values, s.counted.n_gradients)
@@ -245,7 +165,7 @@ def _report(
         )
     _, u, y, g = best
     length = float(np.linalg.norm(g))
-    cosine, gap = _cosine(u, g), (y - s.threshold) / s.scale()
+    cosine, gap = cosine_of(u, g), (y - s.threshold) / s.scale()
     beta = float(u @ g) / max(length, 1e-300) + (s.threshold - y) / max(length, 1e-300)
     reasons = []
     if length == 0.0:

@@ -11,10 +11,8 @@ from jaxtyping import Array, Float, Key
 
 from failure.estimates import GOOD, Estimate, check_threshold, mean_of_terms
 from failure.hlrf import DesignPoint
+from failure.line_roots import curvature, line_roots
 from failure.performances import Counted, Performance, Slopes
-
-STEP = 1.5
-"""Longest step along a line from one evaluation to the next [sigma]."""
 
 BEND = 0.8
 """A boundary that bends towards nominal as the sphere does (1) or more has nearer failures beside
@@ -119,45 +117,23 @@ def sample_lines(
     narrow, slopes_seen = False, []
     while lines < max_lines and not narrow:
         rows = slice(lines, min_lines if lines == 0 else lines + 1)
-        t, back, turned = _roots(counted, float(threshold), across[rows], axis, design.beta, rate)
+        t, back, turned = line_roots(
+            counted, float(threshold), across[rows], axis, design.beta, rate
+        )
         slopes_seen.append(turned)
         distances[rows] = t
         backwards += back
         lines += len(t)
         good = distances[:lines][np.isfinite(distances[:lines])]
         if len(good) >= min_lines:
-            mean, low, high, _ = _interval(good)
+            mean, low, high, _ = interval_of_lines(good)
             narrow = mean > 0.0 and high <= factor * mean and low >= mean / factor
     bend, direction = math.nan, np.full(len(axis), math.nan)
     if counted.has_slopes:
-        bend, direction = _curvature(across[:lines], np.concatenate(slopes_seen), axis, rate)
+        bend, direction = curvature(across[:lines], np.concatenate(slopes_seen), axis, rate)
         bend *= design.beta
     found = _judge(design, distances[:lines], counted, backwards, narrow, factor, bend)
     return Lines(found, bend, direction)
-
-
-def _curvature(
-    across: np.ndarray, gradients: np.ndarray, axis: np.ndarray, rate: float
-) -> tuple[float, np.ndarray]:
-    r"""Largest curvature of the boundary and its direction, from the gradients of the lines.
-
-    The gradient at :math:`v_i + \beta a` turns by :math:`K v_i`. Symmetric K of low rank is found
-    on the span Q of the turns from :math:`Q^\top K v_i = (Q^\top K Q) Q^\top v_i`.
-    """
-    good = np.all(np.isfinite(gradients), axis=1)
-    turns = gradients[good] / rate
-    turns = turns - (turns @ axis)[:, None] * axis
-    # What all turns share is a gradient that was not quite along the axis, not a curvature.
-    turns = turns - turns.mean(0) * (len(turns) > 4)
-    v = across[good] - across[good].mean(0) * (len(turns) > 4)
-    if len(turns) < 3 or not np.any(np.abs(turns) > 1e-9):
-        return 0.0, np.zeros(len(axis))
-    _, size, right = np.linalg.svd(turns, full_matrices=False)
-    rank = min(max(len(turns) // 3, 1), int(np.sum(size > 0.05 * size[0])))
-    q = right[:rank]
-    inner = np.linalg.lstsq(v @ q.T, turns @ q.T, rcond=1e-3)[0]
-    values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
-    return float(values[-1]), vectors[:, -1] @ q
 
 
 STOPPING = 1.25
@@ -167,7 +143,7 @@ Measured on bent boundaries with 10 lines: 95 % covered, against 91 % without.
 """
 
 
-def _interval(t: np.ndarray) -> tuple[float, float, float, float]:
+def interval_of_lines(t: np.ndarray) -> tuple[float, float, float, float]:
     """Mean probability of lines that end at `t`, its interval, effective number of lines."""
     from scipy.special import ndtr
 
@@ -176,63 +152,6 @@ def _interval(t: np.ndarray) -> tuple[float, float, float, float]:
         lower = mean * (lower / mean) ** STOPPING
         upper = min(1.0, mean * (upper / mean) ** STOPPING)
     return mean, lower, upper, effective
-
-
-def _roots(
-    counted: Counted,
-    threshold: float,
-    across: Float[np.ndarray, "m D"],
-    axis: Float[np.ndarray, " D"],
-    beta: float,
-    rate: float,
-) -> tuple[Float[np.ndarray, " m"], int, Float[np.ndarray, "m D"]]:
-    """Where lines meet the threshold, NaN where outputs are invalid; lines that run backwards.
-
-    Third: gradients at the first point of each line, NaN without.
-    """
-    first = np.full(across.shape, np.nan)
-
-    def at(t: np.ndarray, rows: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
-        x = across[rows] + t[:, None] * axis
-        if counted.has_slopes:
-            y, g = counted.slopes(x)
-            fresh = ~np.isfinite(first[rows]).any(1)
-            first[rows[fresh]] = g[fresh]
-            return y, g @ axis
-        return counted(x), np.full(len(x), np.nan)
-
-    every = np.arange(len(across))
-    t = np.full(len(across), beta)
-    y, slope = at(t, every)
-    if not counted.has_slopes:
-        # The second value gives the slope; never closer than rounding would allow.
-        move = np.clip((threshold - y) / rate, -STEP, STEP)
-        move = np.where(np.abs(move) > 0.05, move, np.where(move < 0, -0.05, 0.05))
-        t_new = t + np.nan_to_num(move, nan=0.05)
-        y_new, _ = at(t_new, every)
-        slope = (y_new - y) / (t_new - t)
-        t, y = t_new, y_new
-    backwards = int(np.sum(slope < 0.0))
-    step = _newton(threshold, y, slope, rate)
-    for _ in range(4):
-        # A long last step is a guess: evaluate where it leads and step again.
-        rows = np.flatnonzero((np.abs(step) > 0.5) & np.isfinite(y) & (t + step < beta + 6.0))
-        if rows.size == 0:
-            break
-        t_new = t[rows] + np.clip(step[rows], -STEP, STEP)
-        y_new, slope_new = at(t_new, rows)
-        if not counted.has_slopes:
-            slope_new = (y_new - y[rows]) / (t_new - t[rows])
-        t[rows], y[rows], slope[rows] = t_new, y_new, slope_new
-        step[rows] = _newton(threshold, y_new, slope_new, rate)
-    roots = np.where(np.isfinite(y), t + np.clip(step, -STEP, 2.0 * STEP), np.nan)
-    return roots, backwards, first
-
-
-def _newton(threshold: float, y: np.ndarray, slope: np.ndarray, rate: float) -> np.ndarray:
-    """Step to the threshold; where the line is flat, with a fifth of the design point's slope."""
-    slope = np.where(slope > 0.2 * rate, slope, 0.2 * rate)
-    return np.asarray((threshold - y) / slope)
 
 
 def _judge(
@@ -253,7 +172,7 @@ def _judge(
             math.nan, 0.0, 1.0, cost, counted.n_invalid, 0.0,
             f"only {len(good)} of {lines} lines have finite outputs",
         )  # fmt: skip
-    mean, lower, upper, effective = _interval(good)
+    mean, lower, upper, effective = interval_of_lines(good)
     if not narrow:
         reasons.append(
             f"after {lines} lines the interval is still wider than a factor {factor:g}; the "

@@ -80,6 +80,7 @@ class Counted:
     def __init__(self, performance: Performance, slopes: Slopes | None = None) -> None:
         self._performance, self._slopes = performance, slopes
         self.n_values = self.n_gradients = self.n_invalid = 0
+        self._seen: list[tuple[np.ndarray, np.ndarray]] = []
 
     @property
     def has_slopes(self) -> bool:
@@ -96,7 +97,9 @@ class Counted:
             )
         self.n_values += len(x)
         self.n_invalid += int(np.sum(~np.isfinite(y)))
-        return np.where(np.isfinite(y), y, np.nan)
+        y = np.where(np.isfinite(y), y, np.nan)
+        self._seen.append((np.array(x, np.float64), y))
+        return y
 
     def slopes(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         """Values `[n]` and gradients `[n, D]`, NaN where either is invalid."""
@@ -113,7 +116,14 @@ class Counted:
         self.n_gradients += len(x)
         self.n_invalid += int(bad.sum())
         y[bad], g[bad] = np.nan, np.nan
+        self._seen.append((np.array(x, np.float64), y))
         return y, g
+
+    def samples(self) -> tuple[np.ndarray, np.ndarray]:
+        """Everything that was evaluated, in order: `(x [n, D], y [n])`."""
+        return np.concatenate([x for x, _ in self._seen]), np.concatenate(
+            [y for _, y in self._seen]
+        )
 
     def differences(self, u: np.ndarray, value: float, step: float) -> np.ndarray:
         """Forward differences at one point, `[D]`, D simulations; zero where invalid."""

@@ -14,6 +14,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Float
 
+from failure.exact_tails import beta_of, orthonormal, quadratic_tail, tail, threshold_of
 from failure.performances import Performance
 
 
@@ -40,27 +41,9 @@ class Problem(NamedTuple):
     smooth: bool = True
 
 
-def _axes(dim: int, count: int) -> np.ndarray:
-    """Orthonormal directions that load all parameters, `[count, D]`."""
-    draws = np.random.default_rng(dim).normal(size=(dim, count))
-    return np.linalg.qr(draws)[0].T
-
-
-def _beta(p: float) -> float:
-    from scipy.stats import norm
-
-    return float(norm.isf(p))
-
-
-def _tail(t: Any) -> Any:
-    from scipy.stats import norm
-
-    return norm.sf(t)
-
-
 def linear(p: float, dim: int) -> Problem:
     r"""One half space, :math:`y = a \cdot x`: :math:`P = \Phi(-T)`."""
-    axis, reach = _axes(dim, 1)[0], _beta(p)
+    axis, reach = orthonormal(dim, 1)[0], beta_of(p)
 
     def performance(x: Any) -> Any:
         return x @ jnp.asarray(axis, x.dtype)
@@ -70,13 +53,13 @@ def linear(p: float, dim: int) -> Problem:
 
 def window(p: float, dim: int) -> Problem:
     r"""A two-sided window, :math:`y = |a \cdot x|`: :math:`P = 2 \Phi(-T)`."""
-    axis, reach = _axes(dim, 1)[0], _beta(0.5 * p)
+    axis, reach = orthonormal(dim, 1)[0], beta_of(0.5 * p)
 
     def performance(x: Any) -> Any:
         return jnp.abs(x @ jnp.asarray(axis, x.dtype) + 1e-3) - 1e-3
 
     # The small offset gives nominal a slope; it shifts one side out and one in.
-    exact = float(_tail(reach) + _tail(reach + 2e-3))
+    exact = float(tail(reach) + tail(reach + 2e-3))
     points = np.stack([reach * axis, -(reach + 2e-3) * axis])
     return Problem("window", performance, reach, dim, exact, points)
 
@@ -87,14 +70,14 @@ def opposite_mechanisms(p: float, dim: int) -> Problem:
     .. math:: y = \max(a x - T_1, -a x - T_2, b x - T_3), \qquad
         P = 1 - (1 - \Phi(-T_1) - \Phi(-T_2)) (1 - \Phi(-T_3))
     """
-    a, b = _axes(dim, 2)
-    limits = [_beta(0.5 * p), _beta(0.3 * p), _beta(0.2 * p)]
+    a, b = orthonormal(dim, 2)
+    limits = [beta_of(0.5 * p), beta_of(0.3 * p), beta_of(0.2 * p)]
 
     def performance(x: Any) -> Any:
         u, v = x @ jnp.asarray(a, x.dtype), x @ jnp.asarray(b, x.dtype)
         return jnp.maximum(jnp.maximum(u - limits[0], -u - limits[1]), v - limits[2])
 
-    one, two, three = (float(_tail(t)) for t in limits)
+    one, two, three = (float(tail(t)) for t in limits)
     exact = one + two + three - (one + two) * three
     points = np.stack([limits[0] * a, -limits[1] * a, limits[2] * b])
     return Problem("opposite_mechanisms", performance, 0.0, dim, exact, points)
@@ -102,12 +85,12 @@ def opposite_mechanisms(p: float, dim: int) -> Problem:
 
 def many_regions(p: float, dim: int) -> Problem:
     r"""Eight regions along orthogonal axes: :math:`P = 1 - (1 - \Phi(-T))^8`."""
-    axes, reach = _axes(dim, 8), _beta(p / 8.0)
+    axes, reach = orthonormal(dim, 8), beta_of(p / 8.0)
 
     def performance(x: Any) -> Any:
         return jnp.max(x @ jnp.asarray(axes.T, x.dtype), axis=1)
 
-    exact = float(-math.expm1(8.0 * math.log1p(-_tail(reach))))
+    exact = float(-math.expm1(8.0 * math.log1p(-tail(reach))))
     return Problem("many_regions", performance, reach, dim, exact, reach * axes)
 
 
@@ -116,14 +99,14 @@ def hidden_region(p: float, dim: int) -> Problem:
 
     .. math:: y = \max(a x - T, 20 (b x - T)), \qquad P = 1 - (1 - \Phi(-T))^2
     """
-    a, b = _axes(dim, 2)
-    reach = _beta(0.5 * p)
+    a, b = orthonormal(dim, 2)
+    reach = beta_of(0.5 * p)
 
     def performance(x: Any) -> Any:
         u, v = x @ jnp.asarray(a, x.dtype), x @ jnp.asarray(b, x.dtype)
         return jnp.maximum(u - reach, 20.0 * (v - reach))
 
-    one = float(_tail(reach))
+    one = float(tail(reach))
     return Problem(
         "hidden_region", performance, 0.0, dim, 2.0 * one - one * one, reach * np.stack([a, b])
     )
@@ -137,8 +120,8 @@ def bent(p: float, dim: int) -> Problem:
 
     with :math:`c = 0.02`.
     """
-    axes, bend = _axes(dim, 11), 0.02
-    reach = _solve(lambda t: _quadratic_tail(t, bend, 10), p)
+    axes, bend = orthonormal(dim, 11), 0.02
+    reach = threshold_of(lambda t: quadratic_tail(t, bend, 10), p)
 
     def performance(x: Any) -> Any:
         z = x @ jnp.asarray(axes.T, x.dtype)
@@ -152,13 +135,13 @@ def curved_manifold(p: float, dim: int) -> Problem:
 
     .. math:: P = \int \Phi(-(T + c - c v^2)) \phi(v)\, dv
     """
-    a, b = _axes(dim, 2)
+    a, b = orthonormal(dim, 2)
     bend = 0.15
 
     def exact(t: float) -> float:
-        return _quadratic_tail(t + bend, bend, 1)
+        return quadratic_tail(t + bend, bend, 1)
 
-    reach = _solve(exact, p)
+    reach = threshold_of(exact, p)
 
     def performance(x: Any) -> Any:
         u, v = x @ jnp.asarray(a, x.dtype), x @ jnp.asarray(b, x.dtype)
@@ -175,7 +158,7 @@ def curved_manifold(p: float, dim: int) -> Problem:
 
 def shell(p: float, dim: int) -> Problem:
     r"""Failure on a whole circle: :math:`y = |(a x, b x)|`, :math:`P = e^{-T^2 / 2}`."""
-    axes, reach = _axes(dim, 2), math.sqrt(-2.0 * math.log(p))
+    axes, reach = orthonormal(dim, 2), math.sqrt(-2.0 * math.log(p))
 
     def performance(x: Any) -> Any:
         z = x @ jnp.asarray(axes.T, x.dtype)
@@ -190,7 +173,7 @@ def shell(p: float, dim: int) -> Problem:
 
 def steps(p: float, dim: int) -> Problem:
     r"""A measure that comes in steps, :math:`y = \lfloor 2 a x \rfloor / 2` (a counter)."""
-    axis, reach = _axes(dim, 1)[0], _beta(p)
+    axis, reach = orthonormal(dim, 1)[0], beta_of(p)
 
     def performance(x: Any) -> Any:
         # Steps end at the threshold exactly, so that the probability is that of a half space.
@@ -204,7 +187,7 @@ def never_settles(p: float, dim: int) -> Problem:
 
     .. math:: y = -\log(1 - a x / T) \;\text{for}\; a x < T, \quad \infty \to 10^6 \;\text{else}
     """
-    axis, reach = _axes(dim, 1)[0], _beta(p)
+    axis, reach = orthonormal(dim, 1)[0], beta_of(p)
 
     def performance(x: Any) -> Any:
         share = x @ jnp.asarray(axis, x.dtype) / reach
@@ -212,30 +195,6 @@ def never_settles(p: float, dim: int) -> Problem:
         return jnp.where(share < 1.0, -jnp.log1p(-held), 1e6)
 
     return Problem("never_settles", performance, 25.0, dim, p, reach * axis[None], smooth=False)
-
-
-def _quadratic_tail(t: float, bend: float, count: int) -> float:
-    """P(z + bend chi2_count > t) for independent standard normal z."""
-    from scipy import integrate
-    from scipy.stats import chi2
-
-    # In the normal's own coordinate the integrand of chi2_1 is smooth at 0.
-    if count == 1:
-        f = lambda v: 2.0 * float(_tail(t - bend * v * v)) * math.exp(-0.5 * v * v)  # noqa: E731
-        peak = math.sqrt(max(0.0, (t - 0.5 / bend) / bend)) if bend > 0 else 0.0
-        whole = integrate.quad(f, 0.0, 40.0, points=[peak, 3.0], epsabs=0.0, epsrel=1e-9, limit=400)
-        return float(whole[0] / math.sqrt(2.0 * math.pi))
-    f = lambda s: float(_tail(t - bend * s) * chi2.pdf(s, count))  # noqa: E731
-    return float(
-        integrate.quad(f, 0.0, 400.0, points=[10.0, 60.0], epsabs=0.0, epsrel=1e-9, limit=400)[0]
-    )
-
-
-def _solve(probability: Callable[[float], float], p: float) -> float:
-    """The threshold with this probability."""
-    from scipy.optimize import brentq
-
-    return float(brentq(lambda t: math.log(probability(t) / p), 0.5, 40.0, xtol=1e-12))
 
 
 PROBLEMS: dict[str, Callable[[float, int], Problem]] = {

@@ -9,8 +9,8 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
-from failure.estimates import GOOD, Estimate, check_threshold, log_normal_interval
-from failure.hlrf import DesignPoint, find_design_point
+from failure.estimates import Estimate, add, check_threshold
+from failure.hlrf import DesignPoint, find_design_point, onto_boundary
 from failure.lines import BEND, sample_lines
 from failure.performances import Counted, Performance, Slopes
 
@@ -175,7 +175,7 @@ def probability_by_lines(
         tried = 0
         while len(left := fails[finder.beside(fails)]) and tried < most:
             tried += 1
-            inner = _shortest(counted, float(threshold), left[0])
+            inner = onto_boundary(counted, float(threshold), left[0])
             if (found := finder.find(inner)) is None or not found.converged:
                 fails = fails[np.any(fails != left[0], axis=1)]
                 doubts.append("a wide sample fails beside all regions and leads to no design point")
@@ -211,38 +211,17 @@ def _connected(finder: _Finder, counted: Counted, threshold: float) -> list[str]
     return []
 
 
-def _shortest(counted: Counted, threshold: float, x: np.ndarray) -> np.ndarray:
-    """Towards nominal along the ray until just before it no longer fails."""
-    low, high = 0.0, 1.0
-    for _ in range(5):
-        middle = 0.5 * (low + high)
-        fails = float(np.nan_to_num(counted((middle * x)[None])[0], nan=-np.inf)) > threshold
-        low, high = (low, middle) if fails else (middle, high)
-    return high * x
-
-
 def _sum(finder: _Finder, results: list[Estimate], counted: Counted, doubts: list[str]) -> Regions:
     """Sum of the regions with its interval and verdict."""
-    p = np.array([e.probability for e in results])
     spent = finder.values + finder.gradients + counted.n_values
-    invalid = sum(e.n_invalid for e in results) + counted.n_invalid
-    total = float(np.nansum(p))
-    # Half widths on the logarithmic scale, as the standard errors of independent terms.
-    logs = [math.log(max(e.upper, 1e-300) / max(e.probability, 1e-300)) for e in results]
-    error = math.sqrt(sum((q * w) ** 2 for q, w in zip(p, logs, strict=True)))
-    reasons = [f"region {k + 1}: {e.verdict}" for k, e in enumerate(results) if not e.known]
-    if total > 0.0 and not reasons:
-        lower, upper = log_normal_interval(total, error, 1.0)
-        lower, upper = min(lower, total / 1.01), max(upper, min(1.0, 1.01 * total))
-    else:
-        lower = max((e.lower for e in results), default=0.0)
-        upper = min(1.0, sum(e.upper for e in results))
+    estimate = add(results)
+    invalid = estimate.n_invalid + counted.n_invalid
     if doubts:
-        reasons += sorted(set(doubts))
-        upper = 1.0
-    verdict = "; ".join(reasons) or GOOD
-    effective = min((e.n_effective for e in results), default=0.0)
-    estimate = Estimate(total, lower, upper, spent, invalid, effective, verdict)
+        reasons = [] if estimate.known else [estimate.verdict]
+        verdict = "; ".join([*reasons, *sorted(set(doubts))])
+        estimate = estimate._replace(upper=1.0, verdict=verdict)
+    estimate = estimate._replace(n_simulations=spent, n_invalid=invalid)
+    p, total = np.array([e.probability for e in results]), estimate.probability
     order = np.argsort([point.beta for point in finder.points])
     shares = p[order] / total if total > 0 else np.zeros(len(p))
     return Regions(estimate, [finder.points[k] for k in order], shares, finder.gradients)

@@ -11,9 +11,12 @@ import jax
 import numpy as np
 from jaxtyping import Array, Float, Key
 
+from failure.archive import Archive
+from failure.estimates import Estimate, add
 from failure.exploration import explore
-from failure.worst_case import Archive, Region, find_regions
-from failure.yields import Mixture, SpecYield, interval, line_sampling, mixture_sampling
+from failure.lines import line_sampling
+from failure.worst_case import Region, find_regions
+from failure.yields import Mixture, mixture_sampling
 
 
 @dataclass(frozen=True)
@@ -55,9 +58,9 @@ class SpecAnalysis(NamedTuple):
     """
 
     regions: list[Region]
-    estimate: SpecYield
-    lines: SpecYield | None
-    mixture: SpecYield
+    estimate: Estimate
+    lines: Estimate | None
+    mixture: Estimate
 
     @property
     def distance(self) -> float:
@@ -70,7 +73,7 @@ class Analysis(NamedTuple):
 
     nominal: Float[np.ndarray, "k"]
     specs: list[SpecAnalysis]
-    union: SpecYield
+    union: Estimate
     archive: Archive
 
 
@@ -131,16 +134,18 @@ def analyse(
         archive, nominal, regions, archive.left // 5, reach=config.reach, key=key_explore
     )
     found = [*found, *_seen(archive, found, n_specs)]
-    lines: dict[int, tuple[SpecYield, np.ndarray]] = {}
+    lines: dict[int, Estimate] = {}
     measured = _apart(found)
     if measured:
         share = int(config.line_share * archive.left / (2.5 * len(measured)))
         # Fewer than ten lines say little: then the mixture has to wait.
         most = int(0.9 * archive.left / (3 * len(measured)))
         count = min(max(share, min(10, most)), config.max_lines)
-        for k in measured if count >= 2 else []:
-            sub = jax.random.fold_in(key_lines, k)
-            lines[k] = line_sampling(archive, found[k], count, reach=config.reach, key=sub)
+        for k in measured if count >= 3 else []:
+            lines[k] = line_sampling(
+                archive.violation(found[k].spec, "line"), 0.0, found[k].design,
+                min_lines=count, max_lines=count, key=jax.random.fold_in(key_lines, k),
+            )  # fmt: skip
     mixture = mixture_sampling(archive, found, archive.left, n_specs, key=key_mixture)
     specs = [_of_spec(k, found, lines, mixture, config.reach) for k in range(n_specs)]
     return Analysis(at_origin[0], specs, _of_any(specs, mixture), archive)
@@ -174,7 +179,7 @@ def _apart(regions: list[Region]) -> list[int]:
 def _of_spec(
     spec: int,
     regions: list[Region],
-    lines: dict[int, tuple[SpecYield, np.ndarray]],
+    lines: dict[int, Estimate],
     mixture: Mixture,
     reach: float,
 ) -> SpecAnalysis:
@@ -194,9 +199,8 @@ def _of_spec(
                 verdict="the nearest failing point is not verified",
             )
         return SpecAnalysis(found, other, None, other)
-    # Opposite regions add up; lines of equal number are added term by term.
-    terms = np.sum([lines[k][1] for k in mine], axis=0)
-    by_lines = SpecYield(*interval(terms)[:3], len(terms), interval(terms)[3])
+    # Opposite regions add up.
+    by_lines = add([lines[k] for k in mine])
     estimate = by_lines
     mean, lower, upper = by_lines[:3]
     known = not (math.isnan(mean) or math.isnan(other.probability))
@@ -217,7 +221,7 @@ def _of_spec(
     return SpecAnalysis(found, estimate, by_lines, other)
 
 
-def _of_any(specs: list[SpecAnalysis], mixture: Mixture) -> SpecYield:
+def _of_any(specs: list[SpecAnalysis], mixture: Mixture) -> Estimate:
     """Probability of failing any specification: the sum, corrected for what fails together."""
     estimates = [s.estimate for s in specs]
     known = [e for e in estimates if not math.isnan(e.probability)]
@@ -238,4 +242,5 @@ def _of_any(specs: list[SpecAnalysis], mixture: Mixture) -> SpecYield:
     width = math.exp(min(spread, 700.0))
     lower, upper = max(min(lower, mean), mean / width), min(upper, mean * width)
     verdict = bad[0] if bad else "good"
-    return SpecYield(mean, min(lower, mean), max(upper, mean), mixture.union.n, verdict)
+    n, effective = mixture.union.n_simulations, min(e.n_effective for e in known)
+    return Estimate(mean, min(lower, mean), max(upper, mean), n, 0, effective, verdict)

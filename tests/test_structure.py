@@ -35,16 +35,12 @@ CEILING = 320
 LONGER = {
     "fusion.detection.kitti.average_precision",
     "fusion.lattice.linear",
-    "failure.bnn",
-    "failure.search.bayesopt",
-    "failure.subset",
     "jaxsnn.maps",
     "jaxsnn.network",
     "jaxsnn.plots",
     "jaxsnn.world",
     "snn_fusion_failure.documentation.documented",
     "scripts.benchmarks.bench_fusion",
-    "scripts.studies.study_sigma",
 }
 """Files above the ceiling; the list only shrinks."""
 SAME_MEANING = {
@@ -54,6 +50,7 @@ SAME_MEANING = {
     "presets": "settings of a part by name",
     "circuit": "a circuit as a search takes it",
     "reference": "a circuit in ngspice",
+    "schematic": "a circuit as drawn",
     "status": "how a run ended, and what to do about it",
     "network": "neurons or filters and their connections",
     "geometry": "shapes, distances and overlaps",

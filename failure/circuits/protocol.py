@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property
 from typing import Any, NamedTuple
@@ -16,6 +16,10 @@ from failure.status import Status
 
 CHUNK = 64
 """Samples that are solved side by side; a batch this wide keeps the solver in the cache."""
+
+
+Solve = Callable[[Float[Array, "d b"]], tuple[Float[Array, "m b"], Int[Array, "b"]]]
+"""Batch last: `[d, b] -> (specs [m, b], status [b])`."""
 
 
 class Spec(NamedTuple):
@@ -51,6 +55,8 @@ class Circuit:
     box: float = 3.0
     again: Callable[[Array], tuple[Array, Array]] | None = field(default=None, repr=False)
     """A slower `run` for samples that the first could not solve; compiled when it is needed."""
+    short: Callable[[Array], tuple[Array, Array]] | None = field(default=None, repr=False)
+    """`run` as a program that is quicker to compile, for gradients."""
     _jit: Any = field(init=False, repr=False)
     _jit_again: Any = field(init=False, repr=False)
 
@@ -122,8 +128,46 @@ class Circuit:
             return specs, status.at[rows].set(new_status[: rows.size])
 
 
+def varied_circuit(
+    name: str,
+    model: str,
+    transistors: Sequence[str],
+    quantities: Sequence[tuple[str, str, float]],
+    specs: tuple[Spec, ...],
+    solve: Solve,
+    *,
+    reference: Callable[..., tuple[np.ndarray, np.ndarray]],
+    again: Solve | None = None,
+    short: Solve | None = None,
+) -> Circuit:
+    """A circuit in which the same quantities of every transistor vary, transistor-major.
+
+    Args:
+        name: of the circuit; "_level1" is added where the model is not "ekv".
+        model: MOSFET model.
+        transistors: names.
+        quantities: (name, unit of sigma, sigma) of what varies in each.
+        specs: what is measured.
+        solve: batch last, `[d, b] -> (specs [m, b], status [b])`.
+        reference: the same samples by ngspice.
+        again: a slower `solve` for samples that the first could not solve.
+        short: `solve` as a program that is quicker to compile, for gradients.
+    """
+    return Circuit(
+        name=name if model == "ekv" else f"{name}_{model}",
+        parameter_names=tuple((t, q) for t in transistors for q, _, _ in quantities),
+        sigma=tuple(s for _ in transistors for _, _, s in quantities),
+        parameter_units=tuple(u for _ in transistors for _, u, _ in quantities),
+        specs=specs,
+        run=lambda x: in_chunks(solve, x),
+        reference=reference,
+        again=None if again is None else lambda x: in_chunks(again, x),
+        short=None if short is None else lambda x: in_chunks(short, x),
+    )
+
+
 def in_chunks(
-    solve: Callable[[Float[Array, "d b"]], tuple[Float[Array, "m b"], Int[Array, "b"]]],
+    solve: Solve,
     x: Float[Array, "n d"],
     *,
     chunk: int = CHUNK,

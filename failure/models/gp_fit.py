@@ -9,6 +9,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Int
 
+from failure.models.domains import box
 from failure.models.kernels import (
     GPConfig,
     GPParams,
@@ -19,7 +20,7 @@ from failure.models.kernels import (
     row_mask,
     squared_distance,
 )
-from failure.models.optimize import bfgs, box
+from failure.models.optimize import bfgs
 from failure.models.triangular import gram_of_lower, inverse_factor
 
 _LOG_2PI = math.log(2.0 * math.pi)

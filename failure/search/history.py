@@ -5,6 +5,8 @@ from __future__ import annotations
 from collections.abc import Callable
 from typing import Any, NamedTuple
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from failure.search.methods import SearchConfig
@@ -98,3 +100,14 @@ def first_hit(y: np.ndarray, threshold: float) -> np.ndarray:
         raise ValueError(f"threshold={threshold}: expected a number")
     failed = y > threshold
     return np.where(failed.any(1), failed.argmax(1) + 1.0, np.nan)
+
+
+def seed_keys(config: SearchConfig, n: int) -> Any:
+    """One key per seed for the iteration that follows `n` evaluations."""
+    keys = [jax.random.fold_in(jax.random.key(seed), n) for seed in config.seeds]
+    return jnp.stack(keys)
+
+
+def stack(tree: Any, count: int) -> Any:
+    """The same tree for every seed."""
+    return jax.tree.map(lambda leaf: jnp.stack([leaf] * count), tree)

@@ -13,7 +13,7 @@ from typing import Any, TypeVar
 
 import numpy as np
 
-from failure.search.runs import Simulate
+from failure.search.evaluation import Simulate
 from failure.search.storage import identity_of
 
 T = TypeVar("T")

@@ -12,6 +12,7 @@ A space is a tree of arrays with three methods, so an own one needs no change el
 from __future__ import annotations
 
 import math
+from functools import partial
 from typing import Any, NamedTuple, Protocol, runtime_checkable
 
 import jax
@@ -19,7 +20,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from failure import bnn, revnet
-from failure.models.optimize import Domain, ball, box, project, sample
+from failure.models.domains import Domain, ball, box, project, sample
 from failure.search.task import Task, unit_scale
 
 
@@ -213,3 +214,15 @@ def initial_design(
 ) -> Float[Array, "n d"]:
     """Uniform points of the space's own domain."""
     return sample(space.domain(task), n, key=key)
+
+
+@jax.jit
+def decode(space: Any, domain: Domain, u: Any) -> Any:
+    """`u [S, q, d]` to `(x [S, q, D], clipped [S, q])`."""
+    return jax.vmap(lambda s, block: jax.vmap(partial(s.decode, domain))(block))(space, u)
+
+
+@jax.jit
+def encode(space: Any, x: Any) -> Any:
+    """`x [S, q, D]` to `u [S, q, d]`."""
+    return jax.vmap(lambda s, block: jax.vmap(s.encode)(block))(space, x)

@@ -12,16 +12,14 @@ import hashlib
 import json
 import math
 import os
-import warnings
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
-import jax.numpy as jnp
 import numpy as np
 
 from failure.search.history import SearchConfig, SearchState
-from failure.search.spaces import SPACES
+from failure.search.trees import set_aside, write_whole
 
 FORMAT = 2
 """Version of the folder; 1 kept neither column, sense, simulator nor start."""
@@ -68,25 +66,6 @@ def _digest(identity: Mapping[str, Any]) -> str:
     """Short name of an identity without the budget, which may grow."""
     rest = {k: v for k, v in identity.items() if k != "n_total"}
     return hashlib.sha256(json.dumps(rest, sort_keys=True).encode()).hexdigest()[:12]
-
-
-def set_aside(path: Path, why: str, instead: str) -> None:
-    """Rename a file that cannot be read, and say so."""
-    kept, number = path.with_name(path.name + ".damaged"), 1
-    while kept.exists():
-        kept, number = path.with_name(f"{path.name}.damaged{number}"), number + 1
-    os.replace(path, kept)
-    warnings.warn(f"{path}: {why}; kept as {kept.name}, {instead}", RuntimeWarning, stacklevel=3)
-
-
-def _write(path: Path, write: Callable[[Any], None]) -> None:
-    """Replace a file in one step, so that a kill leaves the old or the new one."""
-    part = path.with_name(path.name + ".part")
-    with part.open("wb") as file:
-        write(file)
-        file.flush()
-        os.fsync(file.fileno())
-    os.replace(part, path)
 
 
 def claim(
@@ -136,7 +115,7 @@ def claim(
                 )
             raise ValueError(f"{folder} holds a search with other settings ({changes}); {hint}")
     if held != wanted:
-        _write(path, lambda file: file.write((json.dumps(wanted, indent=1) + "\n").encode()))
+        write_whole(path, lambda file: file.write((json.dumps(wanted, indent=1) + "\n").encode()))
     return _digest(wanted)
 
 
@@ -228,7 +207,7 @@ def read_log(folder: Path, mark: str | None = None) -> list[dict[str, Any]]:
         good = path.read_bytes().split(b"\n")[: number - 1]
         if "torn" not in why:
             set_aside(path, f"line {number} cannot be read ({why})", "simulated again from there")
-        _write(path, lambda file: file.write(b"".join(line + b"\n" for line in good)))
+        write_whole(path, lambda file: file.write(b"".join(line + b"\n" for line in good)))
     return records
 
 
@@ -244,68 +223,3 @@ def samples(folder: Path | str) -> tuple[np.ndarray, np.ndarray]:
     y = np.concatenate([np.asarray(r["y"], np.float64) for r in records], 1)
     good = np.isfinite(y)
     return x[good], y[good]
-
-
-def _leaves(tree: Any, name: str) -> dict[str, np.ndarray]:
-    """Arrays of nested named tuples and tuples by the path of field names."""
-    if tree is None:
-        return {}
-    if hasattr(tree, "_asdict"):
-        parts = tree._asdict().items()
-    elif isinstance(tree, tuple | list):
-        parts = ((str(k), part) for k, part in enumerate(tree))
-    else:
-        return {name: np.asarray(tree)}
-    return {k: v for key, part in parts for k, v in _leaves(part, f"{name}.{key}").items()}
-
-
-def save_tree(path: Path, tree: Any, at: int) -> None:
-    """Save a space or a surrogate's parts by field names, and the count it was made at."""
-    arrays: dict[str, Any] = _leaves(tree, "tree")
-    kind = np.asarray(type(tree).__name__)
-    _write(path, lambda file: np.savez(file, at=np.asarray(at), kind=kind, **arrays))
-
-
-def _build(arrays: Mapping[str, np.ndarray], name: str, kind: Any, inner: Mapping[str, Any]) -> Any:
-    """The tree below `name`: an array, a tuple, a named tuple, or None where nothing is."""
-    if name in arrays:
-        return jnp.asarray(arrays[name])
-    if not any(key.startswith(f"{name}.") for key in arrays):
-        return None
-    if kind is not None:
-        return kind(
-            **{
-                field: _build(arrays, f"{name}.{field}", inner.get(field), {})
-                for field in kind._fields
-            }
-        )
-    count = len(
-        {key[len(name) + 1 :].split(".")[0] for key in arrays if key.startswith(name + ".")}
-    )
-    return tuple(_build(arrays, f"{name}.{k}", None, {}) for k in range(count))
-
-
-def load_tree(
-    path: Path, kind: Any = None, inner: Mapping[str, Any] | None = None
-) -> tuple[Any, int] | None:
-    """What `save_tree` saved, and its count; None where there is none or it cannot be read.
-
-    Args:
-        path: the file.
-        kind: the class of the tree; one of `spaces.SPACES` by its saved name without.
-        inner: classes of its fields that are named tuples themselves.
-    """
-    if not path.exists():
-        return None
-    try:
-        with np.load(path, allow_pickle=False) as data:
-            arrays = {name: data[name] for name in data.files}
-        if kind is None:
-            kind, inner = SPACES[str(arrays["kind"])]
-        found = _build(arrays, "tree", kind, inner or {})
-        if found is None:
-            raise ValueError("nothing in it")
-        return found, int(arrays["at"])
-    except Exception as error:
-        set_aside(path, f"{type(error).__name__}: {error}", "computed again")
-        return None

@@ -12,7 +12,7 @@ import numpy as np
 from jaxtyping import Float
 
 from failure.models import gp, gp_fit
-from failure.search.history import SearchConfig
+from failure.search.methods import SearchConfig
 from failure.search.spaces import ActiveSubspace
 from failure.search.task import unit_scale
 

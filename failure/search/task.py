@@ -7,7 +7,7 @@ from dataclasses import dataclass
 
 import jax.numpy as jnp
 
-from failure.models.optimize import Domain, ball, box
+from failure.models.domains import Domain, ball, box
 
 KINDS = ("box", "ball")
 SENSES = ("max", "min")

@@ -9,7 +9,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from failure.models.optimize import project, sample
+from failure.models.domains import project, sample
 from failure.search.task import Task, sign_of, task_domain
 
 

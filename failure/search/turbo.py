@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from failure.models.optimize import Domain
+from failure.models.domains import Domain
 
 
 @dataclass(frozen=True)

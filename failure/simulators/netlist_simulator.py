@@ -15,12 +15,13 @@ import numpy as np
 from jaxtyping import Float, Int
 
 from failure.simulators.batches import Batch, check_points
+from failure.simulators.corners import Corner
 from failure.simulators.deck import Deck
 from failure.simulators.measures import Limit, violation
 from failure.simulators.processes import Group, SimulatorError
 from failure.simulators.result_cache import load_record, save_record
 from failure.simulators.spice import printed_numbers, printed_trouble
-from failure.simulators.variation import Corner, Variation
+from failure.simulators.variation import Variation
 from failure.status import Status
 
 NGSPICE = "ngspice -b -n {deck}"

@@ -120,8 +120,8 @@ def compare(seed: int, config: Config, dim: int) -> dict[str, Any]:
     import jax.numpy as jnp
     import numpy as np
 
-    from failure.models import acquisition, gp, gp_fit
-    from failure.models.optimize import box
+    from failure.models import acquisition, candidates, gp, gp_fit
+    from failure.models.domains import box
 
     n = config.n
     x, y = make_data(seed, n, dim)
@@ -151,8 +151,8 @@ def compare(seed: int, config: Config, dim: int) -> dict[str, Any]:
         def suggest(params: Any, y: Any, key: Any, acq: Any, newton_steps: int) -> Any:
             posterior = gp.condition(gp_config, params, px, y, after)
             _, top = jax.lax.top_k(y, 4)
-            raw = acquisition.raw_points(domain, px[top], acq.n_raw, key=key)
-            return acquisition.propose(
+            raw = candidates.raw_points(domain, px[top], acq.n_raw, key=key)
+            return candidates.propose(
                 gp_config, acq, posterior, domain, jnp.max(y), raw, newton_steps=newton_steps
             )
 

@@ -4,8 +4,10 @@
 
 Prints CPU time per sample of the LDO regulator (two operating points and a load step) by the JAX
 solver and by ngspice (level 1, largest step 0.5 ns, as its own defaults would run it), and their
-ratio; both are measured in the same run, in turns. Expect a ratio above 25 (level 1 on both sides)
-on one CPU core; compiling (not counted) takes 10 to 20 s, the run itself about 5 s.
+ratio; both are measured in the same run, in turns. Then the gradient of the undershoot in all 60
+parameters: CPU seconds to compile it, and its cost over that of a simulation. Expect a ratio above
+25 (level 1 on both sides) on one CPU core; compiling the simulation (not counted) takes 10 to 20 s,
+the run itself about 10 s.
 """
 
 from __future__ import annotations
@@ -38,6 +40,8 @@ class Config:
     max_step: float = 0.5e-9
     """Largest time step of ngspice [s]; the solver's parity is tested at 0.1e-9."""
     models: tuple[str, ...] = ("level1", "ekv")
+    gradient: bool = True
+    """Measure the gradient of the undershoot as well: compiling, cost, error."""
     out: Path | None = None
     """Write the result to this JSON file as well."""
 
@@ -79,7 +83,54 @@ def main(config: Config) -> dict[str, Any]:
         result[f"{model}_ms"] = 1e3 * mine
         result[f"{model}_ratio"] = reference / mine
         result[f"{model}_ratios"] = [t / o for t, o in zip(theirs, ours[model], strict=True)]
+    if config.gradient:
+        result |= gradient_of(circuits["ekv"] if "ekv" in circuits else make_ldo("ekv"), x, config)
     return result
+
+
+def gradient_of(circuit: Any, x: Any, config: Config) -> dict[str, Any]:
+    """CPU seconds to trace and compile the undershoot's gradient, its cost over a simulation of the
+    same batch, and its largest distance from central differences over the largest slope."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from failure.circuits.outputs import gradient_program
+
+    def timed(program: Any, at: Any) -> float:
+        jax.block_until_ready(program(at))
+        spent = []
+        for _ in range(config.repeats):
+            start = time.process_time()
+            jax.block_until_ready(program(at))
+            spent.append(time.process_time() - start)
+        return statistics.median(spent)
+
+    column = circuit.spec_index("undershoot")
+    with jax.enable_x64(True):
+        at = jnp.asarray(x)
+        forward = jax.jit(circuit.run)
+        # A program that is in the cache would not be compiled.
+        held = jax.config.read("jax_enable_compilation_cache")
+        jax.config.update("jax_enable_compilation_cache", False)
+        start = time.process_time()
+        program = gradient_program(circuit, column).lower(at).compile()
+        compiling = time.process_time() - start
+        jax.config.update("jax_enable_compilation_cache", held)
+        simulation, gradient = timed(forward, at), timed(program, at)
+        (_, (_, status)), slopes = program(at)
+        slopes, good = np.asarray(slopes), np.asarray(status) == 0
+        error = 0.0
+        for k in range(0, circuit.n_dims, 7):
+            step = jnp.zeros_like(at).at[:, k].set(1e-3)
+            up, down = (np.asarray(forward(at + s * step)[0])[:, column] for s in (1.0, -1.0))
+            error = max(error, float(np.abs(slopes[:, k] - (up - down) / 2e-3)[good].max()))
+    return {
+        "gradient_compile_s": compiling,
+        "gradient_ms": 1e3 * gradient / config.batch,
+        "gradient_ratio": gradient / simulation,
+        "gradient_error": error / float(np.abs(slopes[good]).max()),
+    }
 
 
 def record(config: Config) -> dict[str, Any]:

@@ -71,7 +71,7 @@ def study(config: Config, circuit: Any, column: int) -> dict[str, Any]:
     import jax.numpy as jnp
     import numpy as np
 
-    from failure import active, plots, rev_argate, revnet
+    from failure import active, feature_ranking, plots, rev_argate, revnet
 
     spec = circuit.specs[column]
     if config.runs is not None:
@@ -97,9 +97,11 @@ def study(config: Config, circuit: Any, column: int) -> dict[str, Any]:
     )  # fmt: skip
     error = rev_argate.predict(settings, params, data[-cut:]) - target[-cut:]
     found = active.activity(settings, params, data)
-    nine = int(rev_argate.active_features(jnp.asarray(found.weights)[None], 0.9)[1])
+    nine = int(feature_ranking.active_features(jnp.asarray(found.weights)[None], 0.9)[1])
     z = revnet.forward(params.network, data)
-    on_active, on_all = rev_argate.check_active(z, target, found.order, found.n_active, key=check)
+    on_active, on_all = feature_ranking.check_active(
+        z, target, found.order, found.n_active, key=check
+    )
     shares = active.by_transistor(circuit.parameter_names, found.parameters)
     picture = config.out / f"active_{circuit.name}_{spec.name}.png"
     picture.parent.mkdir(parents=True, exist_ok=True)

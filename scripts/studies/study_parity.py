@@ -1,12 +1,14 @@
 """How well the circuit solver agrees with ngspice, and how smooth and how robust it is.
 
-    python scripts/studies/study_parity.py [--parts ldo_ngspice ldo_grid box dcdc_ngspice dcdc_grid]
+    python scripts/studies/study_parity.py [--parts ldo_ngspice ldo_far ldo_grid ...]
 
 Parts, each written to `results/study_circuit_parity.json` as soon as it is measured:
 
 - `ldo_ngspice`: LDO regulator, level 1, against ngspice's own level 1 over normal samples: DC
   error, difference of the undershoot, rank correlation of every specification; the undershoot a
   second time with the same constant gate capacitances on both sides (EKV).
+- `ldo_far`: the undershoot where failures are: normal samples moved to up to 6 sigma along the
+  undershoot's slope, the solver of the searches (EKV) against ngspice with the same equations.
 - `ldo_grid`: undershoot on the shipped grid against one with steps ten times shorter.
 - `box`: share of samples of the parameter box that do not converge, both circuits.
 - `dcdc_ngspice`: DC-DC converter against a transient of all transistors over all periods, and that
@@ -45,8 +47,11 @@ TARGETS = {
 class Config:
     """Sizes of the study."""
 
-    parts: tuple[str, ...] = ("ldo_ngspice", "ldo_grid", "box", "dcdc_ngspice", "dcdc_grid")
+    parts: tuple[str, ...] = (
+        "ldo_ngspice", "ldo_far", "ldo_grid", "box", "dcdc_ngspice", "dcdc_grid",
+    )  # fmt: skip
     ldo_samples: int = 200
+    far_samples: int = 200
     dcdc_samples: int = 40
     grid_samples: int = 64
     box_samples: int = 4096
@@ -110,6 +115,36 @@ def ldo_ngspice(config: Config) -> dict[str, Any]:
             "rank_correlation": ranks(ours[good], theirs[good], circuit.spec_names),
         }
     return result
+
+
+def ldo_far(config: Config) -> dict[str, Any]:
+    """Undershoot of the LDO regulator against ngspice, out to 6 sigma along its slope."""
+    import numpy as np
+
+    from failure import circuits
+
+    circuit = circuits.get("ldo")
+    step = 0.1 * np.eye(circuit.n_dims)
+    moved, _ = circuit.simulate(np.concatenate([step, -step]))
+    up, down = np.asarray(moved)[:, 1].reshape(2, -1)
+    axis = (up - down) / np.linalg.norm(up - down)
+    x = np.random.default_rng(config.seed + 3).normal(size=(config.far_samples, len(axis)))
+    reach = np.linspace(0.0, 6.0, len(x))
+    x += (reach - x @ axis)[:, None] * axis
+    ours, status = (np.asarray(a) for a in circuit.simulate(x))
+    theirs, failed = circuit.reference(x, workers=config.workers, max_step=0.2e-9)
+    good = (status == 0) & (failed == 0)
+    apart = np.abs(ours - theirs)[good, 1]
+    return {
+        "samples": len(x),
+        "compared": int(good.sum()),
+        "not_converged": int((status != 0).sum()),
+        "ngspice_failed": int((failed != 0).sum()),
+        "undershoot_largest_V": float(theirs[good, 1].max()),
+        "undershoot_difference_max_V": float(apart.max()),
+        "undershoot_difference_median_V": float(np.median(apart)),
+        "beyond_2_mV": int((apart > 2e-3).sum()),
+    }
 
 
 def ldo_grid(config: Config) -> dict[str, Any]:
@@ -213,6 +248,7 @@ def dcdc_grid(config: Config) -> dict[str, Any]:
 
 PARTS: dict[str, Callable[[Config], dict[str, Any]]] = {
     "ldo_ngspice": ldo_ngspice,
+    "ldo_far": ldo_far,
     "ldo_grid": ldo_grid,
     "box": box,
     "dcdc_ngspice": dcdc_ngspice,
@@ -245,6 +281,8 @@ def summary(held: dict[str, Any]) -> dict[str, float]:
         found["dc_error"] = part["dc_relative_error_max"]
         found["undershoot_mV"] = 1e3 * part["undershoot_difference_max_V"]
         found["ldo_rank"] = min(part["rank_correlation"].values())
+    if "ldo_far" in held:
+        found["far_undershoot_mV"] = 1e3 * held["ldo_far"]["undershoot_difference_max_V"]
     if "box" in held:
         found["not_converged"] = held["box"]["ldo"]["share"]
     if "dcdc_ngspice" in held:

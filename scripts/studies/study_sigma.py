@@ -7,45 +7,39 @@ Parameters are standard normal in units of sigma. Problems whose probability is 
 probability, which are measured first: long line sampling moves the threshold until the probability
 is the wanted one, and importance sampling from the same point checks it.
 
-Methods: `lines` (design point, then line sampling), `regions` (all regions that can be found, each
-by lines), `importance_sampling` from the design point, `subset_simulation`; with `+gradient` where
-gradients are used, each counted as one simulation. A row of record holds simulations to the first
-failure, the share of runs that end within a factor 2 of the truth with a verdict "good"
-(`success_rate`), what they cost (`sims_factor2`), the share of all intervals that hold the truth
-(`coverage`), and the cosine between the design point that was found and a true one. Every cell
-is kept in `--out`, so the command can be killed and repeated. Writes `results/table_4_sigma.json`;
-the default takes about 6 CPU-minutes, a specification 3 more.
+Methods: `lines` (design point, then line sampling), `guided_lines` (values only, direction from a
+Gaussian process), `regions` (all regions that can be found, each by lines), `ak_is` (importance
+sampling on a refined Gaussian process), `importance_sampling` from the design point,
+`subset_simulation`; with `+gradient` where gradients are used, each counted as one simulation
+(`sims_factor2`) or as three (`sims_factor2_price3`). `--searches` look for the first failure in the
+ball of 1.1 design distances. A row of record holds simulations to the first failure, the share of
+runs that end within a factor 2 of the truth with a verdict "good" (`success_rate`; of searches the
+share that finds a failure), what they cost, the share of all intervals that hold the truth
+(`coverage`), and the cosine between the design point that was found and a true one. Every cell is
+kept in `--out`, so the command can be killed and repeated. Writes `results/table_4_sigma.json`.
 """
 
 from __future__ import annotations
 
-import json
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, NamedTuple
+from typing import Any
 
 from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.sigma_cases import SPECS, Case, cached, circuit_case, problem_case
+from snn_fusion_failure.records.sigma_searches import (
+    SEARCHES,
+    monte_carlo_rows,
+    rows_of_search,
+    search_runs,
+)
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     progress,
     repository,
-    write_json,
 )
 from snn_fusion_failure.runs.command import run_command
-
-SPECS = {
-    "iq": ("ldo", "quiescent_current"),
-    "undershoot": ("ldo", "undershoot"),
-    "load_regulation": ("ldo", "load_regulation"),
-    "overshoot": ("dcdc", "overshoot"),
-    "output_accuracy": ("dcdc", "output_accuracy"),
-}
-"""Name in the table -> circuit and specification."""
-
-LINES = 400
-"""Lines behind the probability at a measured threshold."""
 
 
 @dataclass(frozen=True)
@@ -70,126 +64,16 @@ class Config:
     """Methods."""
     seeds: int = 20
     """Runs of each method."""
+    searches: tuple[str, ...] = ()
+    """Searches for the first failure, keys of `sigma_searches.SEARCHES`."""
+    search_seeds: int = 10
+    """Runs of each search."""
+    search_most: int = 150
+    """Simulations of each search at most."""
     out: Path = Path("runs/study_sigma")
     """Folder of the cells."""
     record: Path = repository.RESULTS / "table_4_sigma.json"
     """Table of record."""
-
-
-class Case(NamedTuple):
-    """A row: what is simulated, its threshold, the truth."""
-
-    row: str
-    performance: Callable[[Any], Any]
-    slopes: Callable[[Any], Any]
-    threshold: float
-    dim: int
-    truth: float
-    points: Any
-    batched: Callable[[Any], Any]
-
-
-def problem_case(name: str, p: float, dim: int) -> Case:
-    """A problem of known probability."""
-    import jax
-
-    from failure.performances import slopes_by_jax
-    from failure.problems import make_problem
-
-    problem = make_problem(name, p, dim)
-    with jax.enable_x64(True):
-        program = jax.jit(problem.performance)
-    return Case(
-        f"{name} P={p:.0e}", program, slopes_by_jax(problem.performance), problem.threshold,
-        dim, problem.probability, problem.points, problem.performance,
-    )  # fmt: skip
-
-
-def circuit_case(name: str, p: float, folder: Path) -> Case:
-    """A specification at the threshold of a wanted probability."""
-    import numpy as np
-
-    from failure import circuits
-
-    circuit_name, spec = SPECS[name]
-    circuit = circuits.get(circuit_name)
-    column, dim = circuit.spec_index(spec), circuit.n_dims
-    sign = 1.0 if circuit.specs[column].sense == "max" else -1.0
-
-    def performance(x: Any) -> Any:
-        x = np.asarray(x, np.float64)
-        # Two sizes of batch in all, so that two programs are compiled.
-        size = 8 if len(x) <= 8 else 128
-        fill = -len(x) % size
-        blocks = np.concatenate([x, np.repeat(x[-1:], fill, axis=0)]).reshape(-1, size, dim)
-        values = []
-        for block in blocks:
-            specs, status = circuit.simulate(block)
-            y = np.asarray(specs)[:, column]
-            values.append(np.where(np.asarray(status) == 0, sign * y, np.nan))
-        return np.concatenate(values)[: len(x)]
-
-    def slopes(x: Any) -> Any:
-        """Central differences in the place of an adjoint; counted as one simulation."""
-        x = np.asarray(x, np.float64)
-        step = 2e-3 * np.eye(dim)
-        up, down = (x[:, None] + s * step for s in (1.0, -1.0))
-        y = performance(np.concatenate([x, up.reshape(-1, dim), down.reshape(-1, dim)]))
-        n = len(x)
-        both = y[n:].reshape(2, n, dim)
-        return y[:n], (both[0] - both[1]) / 4e-3
-
-    target = cached(
-        folder / f"threshold_{name}_{p:.0e}.json",
-        lambda: measured_threshold(performance, slopes, dim, p),
-    )
-    return Case(
-        f"{name} P={p:.0e}", performance, slopes, target["threshold"], dim,
-        target["probability"], np.asarray(target["point"])[None], performance,
-    )  # fmt: skip
-
-
-def cached(path: Path, make: Callable[[], Any]) -> Any:
-    """A JSON value that is computed once."""
-    if not path.exists():
-        write_json(path, make())
-    return json.loads(path.read_text(encoding="utf-8"))
-
-
-def measured_threshold(performance: Any, slopes: Any, dim: int, p: float) -> dict[str, Any]:
-    """The threshold whose probability is p, to a few percent; the probability there, measured."""
-    import jax
-    import numpy as np
-    from scipy.stats import norm
-
-    from failure.hlrf import find_design_point
-    from failure.lines import line_sampling
-    from failure.rare_events import importance_sampling
-
-    y, g = slopes(np.zeros((1, dim)))
-    threshold = float(y[0]) + float(norm.isf(p)) * float(np.linalg.norm(g[0]))
-    for _ in range(4):
-        design = find_design_point(performance, threshold, dim, slopes=slopes)
-        found = line_sampling(
-            performance, threshold, design, key=jax.random.key(7), min_lines=30, max_lines=30
-        )
-        gap = float(norm.isf(p) - norm.isf(found.probability))
-        if abs(gap) < 0.01:
-            break
-        threshold += gap * float(np.linalg.norm(design.gradient))
-    design = find_design_point(performance, threshold, dim, slopes=slopes)
-    exact = line_sampling(
-        performance, threshold, design, key=jax.random.key(8), min_lines=LINES, max_lines=LINES
-    )
-    check = importance_sampling(
-        performance, threshold, design.point[None], key=jax.random.key(9), n=1500
-    )
-    return {
-        "threshold": threshold, "probability": exact.probability,
-        "interval": [exact.lower, exact.upper], "point": design.point, "beta": design.beta,
-        "check": check.probability, "check_interval": [check.lower, check.upper],
-        "verdict": exact.verdict,
-    }  # fmt: skip
 
 
 def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
@@ -198,6 +82,8 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
     import numpy as np
 
     from failure import rare_events
+    from failure.ak_sampling import ak_sampling
+    from failure.guided_lines import guided_lines
     from failure.hlrf import find_design_point
     from failure.regions import probability_by_lines
 
@@ -206,7 +92,15 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
     first = cosine = math.nan
     spent = 0
     base = method.removesuffix("+gradient")
-    if base == "subset_simulation":
+    gradients = 0
+    if base == "ak_is":
+        ak = ak_sampling(case.performance, case.threshold, case.dim, key=key, slopes=slopes)
+        found, first, gradients = ak.estimate, ak.first_failure, ak.n_gradients
+        cosine = nearest(case, ak.point)
+    elif base == "guided_lines":
+        found, point, first = guided_lines(case.performance, case.threshold, case.dim, key=key)
+        cosine = nearest(case, point)
+    elif base == "subset_simulation":
         found = rare_events.subset_simulation(
             case.batched, case.threshold, case.dim, key=key, n=500, replicates=5
         )
@@ -214,7 +108,7 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
         regions = probability_by_lines(
             case.performance, case.threshold, case.dim, key=key, slopes=slopes
         )
-        found = regions.estimate
+        found, gradients = regions.estimate, regions.n_gradients
         # A descent counts from its own start: there is no count to the first failure of them all.
         cosine = nearest(case, regions.points[0].point)
     else:
@@ -223,11 +117,13 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
             case.performance, case.threshold, case.dim, slopes=slopes, start=start, seed=seed
         )
         spent = design.n_simulations + design.n_gradients
+        gradients = design.n_gradients
         first, cosine = design.first_failure, nearest(case, design.point)
         if base == "lines":
             found = rare_events.line_sampling(
                 case.performance, case.threshold, design, key=key, slopes=slopes
             )
+            gradients += found.n_simulations if slopes else 0
         elif design.converged:
             found = rare_events.importance_sampling(
                 case.performance, case.threshold, design.point[None], key=key, n=300
@@ -237,7 +133,7 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
     return {
         "simulations": spent + found.n_simulations, "probability": found.probability,
         "lower": found.lower, "upper": found.upper, "verdict": found.verdict,
-        "first_failure": first, "cosine": cosine,
+        "first_failure": first, "cosine": cosine, "gradients": gradients,
     }  # fmt: skip
 
 
@@ -261,6 +157,11 @@ def rows_of(case: Case, method: str, runs: list[dict[str, Any]]) -> list[dict[st
         r["verdict"] == "good" and 0.5 <= number(r["probability"]) / case.truth <= 2.0 for r in runs
     ]
     cost = [float(r["simulations"]) for r, good in zip(runs, near, strict=True) if good]
+    dear = [
+        float(r["simulations"]) + 2.0 * float(r["gradients"])
+        for r, good in zip(runs, near, strict=True)
+        if good and "gradients" in r
+    ]
     first = [v for r in runs if math.isfinite(v := number(r["first_failure"]))]
     cosine = [v for r in runs if math.isfinite(v := number(r["cosine"]))]
     n = len(runs)
@@ -274,6 +175,7 @@ def rows_of(case: Case, method: str, runs: list[dict[str, Any]]) -> list[dict[st
     ]  # fmt: skip
     for metric, unit, values in (
         ("sims_factor2", "simulations", cost),
+        ("sims_factor2_price3", "simulations", dear if method.endswith("+gradient") else []),
         ("first_failure", "simulations", first),
         ("design_point_cosine", "1", cosine),
     ):
@@ -287,6 +189,9 @@ def main(config: Config) -> dict[str, Any]:
     for name in config.specs:
         if name not in SPECS:
             raise ValueError(f"specs={name!r}: expected some of {', '.join(SPECS)}")
+    for name in config.searches:
+        if name not in SEARCHES:
+            raise ValueError(f"searches={name!r}: expected some of {', '.join(SEARCHES)}")
     if config.seeds < 1:
         raise ValueError(f"seeds={config.seeds}: expected at least 1")
     enable_compilation_cache()
@@ -301,6 +206,7 @@ def main(config: Config) -> dict[str, Any]:
                     case = circuit_case(name, p, config.out)
                 else:
                     case = problem_case(name, p, config.dim)
+                rows += other_rows(config, case)
                 for method in config.methods:
                     bar.update(job, status=f"{case.row} {method}")
                     folder = config.out / case.row.replace(" ", "_") / method
@@ -314,6 +220,23 @@ def main(config: Config) -> dict[str, Any]:
                     record_table(config.record, "4.sigma", title, new, preset="paper")
                     bar.advance(job)
     return {"rows": rows}
+
+
+def other_rows(config: Config, case: Case) -> list[dict[str, Any]]:
+    """What Monte Carlo is expected to need, and the searches for a first failure."""
+    rows = monte_carlo_rows(case.row, case.truth, case.threshold)
+    for name in config.searches:
+        path = config.out / case.row.replace(" ", "_") / name / f"first_{config.search_seeds}.json"
+        runs = cached(
+            path,
+            lambda n=name: search_runs(  # type: ignore[misc]
+                n, case.performance, case.slopes, case.threshold, case.points,
+                seeds=config.search_seeds, most=config.search_most,
+            ),
+        )  # fmt: skip
+        rows += rows_of_search(case.row, name, case.truth, case.threshold, runs)
+    record_table(config.record, "4.sigma", "Failures at fixed probability", rows, preset="paper")
+    return rows
 
 
 def result(found: dict[str, Any]) -> dict[str, Any]:

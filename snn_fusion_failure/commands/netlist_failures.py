@@ -90,10 +90,11 @@ def settings_of(config: NetlistConfig) -> dict[str, Any]:
 
 def prepare(config: NetlistConfig) -> Any:
     """The simulator of the options, everything checked."""
+    from failure.simulators.corners import pvt_corners
     from failure.simulators.deck import read_deck
     from failure.simulators.measures import one_sided, parse_limit
     from failure.simulators.netlist_simulator import NetlistSimulator
-    from failure.simulators.variation import parse_variation, pvt_corners
+    from failure.simulators.variation import parse_variation
 
     return NetlistSimulator(
         read_deck(config.netlist),

@@ -16,11 +16,9 @@ PACKAGES = {
 BY_PATH = {
     "jaxsnn.brax_env": "robots as environments of brax, and what brax needs to run them",
     "jaxsnn.drivers": "drivers that do not learn, for comparison",
-    "jaxsnn.map_files": "maps in files and by name",
     "jaxsnn.navigation": "the robot as a task for PPO",
     "jaxsnn.ppo": "proximal policy optimisation",
     "jaxsnn.plots": "pictures (matplotlib)",
-    "jaxsnn.saved": "trained networks in files",
     "fusion.data.fixed": "the failing sensors that the source prints",
     "fusion.estimator": "ARGate with the face of scikit-learn",
     "fusion.modules": "ARGate and its loss around flax modules of one's own",

@@ -162,7 +162,7 @@ def _notes(canvas: Canvas, y: float, lines: str) -> None:
 
 def ldo() -> str:
     """The low-dropout regulator."""
-    from failure.circuits.ldo.regulator import I_HEAVY, I_LIGHT, KNEE, NETLIST, T_STEP
+    from failure.circuits.ldo.schematic import I_HEAVY, I_LIGHT, KNEE, NETLIST, T_STEP
 
     canvas = Canvas(1400, 490, "Low-dropout regulator: 20 transistors and their connections")
     canvas.text(20, 30, "Low-dropout regulator", size=18, anchor="start", bold=True)

@@ -9,10 +9,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure import bnn, revnet
+from failure import bayesian_linear, bnn, revnet
 from failure.circuits.buck import cycle
 from failure.circuits.solver import mosfet
-from failure.models import acquisition, gp, gp_fit, optimize
+from failure.models import acquisition, domains, gp, gp_fit
 from failure.models.kernels import KERNELS
 from failure.search import spaces, turbo
 from failure.search.task import task_domain
@@ -130,13 +130,13 @@ CASES = [
     ),
     Case("gp_fit.log_prior", lambda p: gp_fit.log_prior(GP, p), lambda rng: (gp_params(rng),)),
     Case(
-        "optimize.project",
-        lambda x: optimize.project(optimize.ball(3, 1.0), x) ** 2,
+        "domains.project",
+        lambda x: domains.project(domains.ball(3, 1.0), x) ** 2,
         normal((3,)),
     ),
     Case(
-        "optimize.sample",
-        lambda k: optimize.sample(optimize.box(-jnp.ones(3), jnp.ones(3)), 4, key=k),
+        "domains.sample",
+        lambda k: domains.sample(domains.box(-jnp.ones(3), jnp.ones(3)), 4, key=k),
         lambda rng: (key(rng),),
         (),
         "a draw",
@@ -164,7 +164,7 @@ CASES = [
     Case(
         "turbo.trust_region",
         lambda centre, length, scales: turbo.trust_region(
-            optimize.box(-jnp.ones(D), jnp.ones(D)), centre, length, scales
+            domains.box(-jnp.ones(D), jnp.ones(D)), centre, length, scales
         )[:2],
         lambda rng: (rng.uniform(-0.2, 0.2, D), np.float64(0.4), 0.1 * rng.normal(size=D)),
         (0, 1, 2),
@@ -198,8 +198,10 @@ CASES = [
         (2,),
     ),
     Case(
-        "bnn.predict_linear",
-        lambda x, y, new: bnn.predict_linear(bnn.fit_linear(x, y, iterations=3), new)[0],
+        "bayesian_linear.predict_linear",
+        lambda x, y, new: bayesian_linear.predict_linear(
+            bayesian_linear.fit_linear(x, y, iterations=3), new
+        )[0],
         normal((8, 2), (8, 3), (4, 2)),
         (2,),
     ),

@@ -204,7 +204,7 @@ def test_the_callers_precision_is_left_alone(full_run):
 
 
 def test_hyper_parameters_are_fitted_to_a_part_of_many_points():
-    from failure.search.bayesopt import FIT_POINTS, fit_rows
+    from failure.search.surrogates import FIT_POINTS, fit_rows
 
     y = np.stack([np.arange(1000.0), -np.arange(1000.0)])
     y[0, 999] = np.nan

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure import bnn
+from failure import bayesian_linear, bnn
 
 CONFIG = bnn.BNNConfig(hidden=8, steps=1500)
 
@@ -65,7 +65,7 @@ def test_conjugate_baseline_is_the_textbook_posterior():
         weights = rng.normal(size=(4, 2))
         phi = np.concatenate([x, np.ones((50, 1))], 1)
         y = phi @ weights + 0.1 * rng.normal(size=(50, 2))
-        posterior = bnn.fit_linear(jnp.asarray(x), jnp.asarray(y), prior_variance=4.0)
+        posterior = bayesian_linear.fit_linear(jnp.asarray(x), jnp.asarray(y), prior_variance=4.0)
         # the covariance gives the noise back: S = (Phi' Phi / s2 + I / 4)^-1
         noise = 0.01
         for _ in range(50):
@@ -75,14 +75,16 @@ def test_conjugate_baseline_is_the_textbook_posterior():
             noise = np.mean(np.sum((y - phi @ mean) ** 2, 0)) / (50 - effective)
         np.testing.assert_allclose(posterior.mean, mean, rtol=1e-6)
         np.testing.assert_allclose(posterior.covariance, s, rtol=1e-6, atol=1e-12)
-        predicted, variance = bnn.predict_linear(posterior, jnp.asarray(x[:5]))
+        predicted, variance = bayesian_linear.predict_linear(posterior, jnp.asarray(x[:5]))
         np.testing.assert_allclose(predicted, phi[:5] @ mean, rtol=1e-6)
         np.testing.assert_allclose(variance, np.sum(phi[:5] @ s * phi[:5], 1), rtol=1e-6)
-        draws = bnn.sample_linear(posterior, jnp.asarray(x[:5]), 4000, key=jax.random.key(0))
+        draws = bayesian_linear.sample_linear(
+            posterior, jnp.asarray(x[:5]), 4000, key=jax.random.key(0)
+        )
         np.testing.assert_allclose(draws.mean(0), predicted, atol=0.01)
         np.testing.assert_allclose(draws.std(0)[:, 0], np.sqrt(variance), rtol=0.1)
 
 
 def test_unequal_rows_are_refused():
     with pytest.raises(ValueError, match="x has 3 rows and y 4"):
-        bnn.fit_linear(jnp.zeros((3, 1)), jnp.zeros((4, 1)))
+        bayesian_linear.fit_linear(jnp.zeros((3, 1)), jnp.zeros((4, 1)))

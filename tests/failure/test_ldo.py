@@ -10,14 +10,9 @@ import pytest
 
 from failure import circuits
 from failure.circuits.ldo.circuit import make_ldo
-from failure.circuits.ldo.regulator import (
-    I_HEAVY,
-    NETLIST,
-    lowest,
-    solve_ldo,
-    time_grid,
-    unresolved,
-)
+from failure.circuits.ldo.regulator import lowest, solve_ldo, time_grid, unresolved
+from failure.circuits.ldo.schematic import I_HEAVY, NETLIST
+from failure.circuits.outputs import performance_of, slopes_of
 from failure.circuits.solver import ngspice
 from failure.circuits.solver.netlist import Mosfet
 from failure.status import Status
@@ -160,3 +155,20 @@ def test_samples_of_the_box_converge() -> None:
     _, status = circuits.get("ldo").simulate(x)
     assert np.mean(np.asarray(status) != 0) < 1e-3
     assert I_HEAVY > 0
+
+
+def test_a_gradient_program_gives_the_same_values_and_the_slopes_of_differences() -> None:
+    """One batch for both sides; three columns of transistors that matter, one that hardly does."""
+    circuit = circuits.get("ldo")
+    values, slopes = performance_of(circuit, "undershoot"), slopes_of(circuit, "undershoot")
+    x = np.random.default_rng(5).normal(size=(2, 60))
+    columns = (4, 31, 55)
+    moved = [x + s * 1e-3 * np.eye(60)[k] for k in columns for s in (1.0, -1.0)]
+    y = values(np.concatenate([x, *moved]))
+    found, gradient = slopes(x)
+    # Newton ends a step at 1e-8 V, and the two programs round differently on the way.
+    np.testing.assert_allclose(found, y[:2], rtol=1e-6)
+    differences = y[2:].reshape(len(columns), 2, 2)
+    for k, (up, down) in zip(columns, differences, strict=True):
+        scale = np.abs(gradient).max()
+        np.testing.assert_allclose(gradient[:, k], (up - down) / 2e-3, atol=1e-4 * scale)

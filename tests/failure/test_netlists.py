@@ -9,11 +9,12 @@ import numpy as np
 import pytest
 
 from failure.simulators import SimulatorError
+from failure.simulators.corners import Corner, pvt_corners
 from failure.simulators.deck import parse_deck, read_deck
 from failure.simulators.measures import parse_limit, violation
 from failure.simulators.netlist_simulator import NetlistSimulator
 from failure.simulators.spice import parse_number, printed_numbers
-from failure.simulators.variation import Corner, parse_variation, pvt_corners
+from failure.simulators.variation import parse_variation
 from failure.status import Status
 
 NETLIST = """a divider

@@ -8,7 +8,7 @@ from scipy.stats import spearmanr
 
 from failure.circuits.ldo.circuit import make_ldo
 from failure.circuits.ldo.reference import ldo_decks
-from failure.circuits.solver import ngspice
+from failure.circuits.solver import decks, ngspice
 from failure.circuits.solver.netlist import (
     Capacitor,
     CurrentSource,
@@ -39,7 +39,7 @@ def test_time_limit_and_broken_deck() -> None:
     with pytest.raises(ngspice.NgspiceError, match=r"more than 0\.2 s"):
         ngspice.run(deck, timeout=0.2)
     with pytest.raises(ngspice.NgspiceError, match="no result"):
-        ngspice.run(ngspice.deck("broken", ["R1 a 0 nonsense q"], ["op", "print v(b)"]))
+        ngspice.run(decks.deck("broken", ["R1 a 0 nonsense q"], ["op", "print v(b)"]))
     numbers, status = ngspice.run_many([deck], ("iq",), timeout=0.2)
     assert np.isnan(numbers).all() and status.tolist() == [1]
 
@@ -65,10 +65,10 @@ def test_every_linear_element_means_the_same() -> None:
         v = np.asarray(dc(system, values).v)[:, 0]
         values = jax.tree.map(np.asarray, values)
     empty = jnp.zeros((0, 1))
-    lines = ngspice.elements(netlist, values, 0, geometry=(np.asarray(empty), np.asarray(empty)))
+    lines = decks.elements(netlist, values, 0, geometry=(np.asarray(empty), np.asarray(empty)))
     names = ("b", "c", "d")
     control = ["op", *(f"let n{n}=v({n})\nprint n{n}" for n in names)]
-    found = ngspice.run(ngspice.deck("all", lines, control, options="reltol=1e-9 vntol=1e-12"))
+    found = ngspice.run(decks.deck("all", lines, control, options="reltol=1e-9 vntol=1e-12"))
     for name in names:
         assert found[f"n{name}"] == pytest.approx(v[system.index(name)], abs=1e-8)
 

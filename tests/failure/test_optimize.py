@@ -4,7 +4,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from failure.models.optimize import ball, bfgs, box, polish, sample
+from failure.models.domains import ball, box, sample
+from failure.models.optimize import bfgs, polish
 
 
 @pytest.fixture(autouse=True)

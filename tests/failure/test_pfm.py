@@ -7,7 +7,7 @@ import pytest
 
 from failure import circuits
 from failure.circuits.buck import light_load, schematic
-from failure.circuits.solver import ngspice
+from failure.circuits.solver import decks, ngspice
 from failure.circuits.solver.mosfet import MosParams
 from failure.circuits.solver.netlist import VoltageSource
 
@@ -120,10 +120,10 @@ def test_trip_offset_is_that_of_ngspice() -> None:
     width = np.array([[m.width] for m in mosfets]) * (1 + 0.01 * u[:, 1])
     length = np.array([[m.length] for m in mosfets]) * (1 + 0.01 * u[:, 0])
     for k in range(3):
-        lines = ngspice.elements(light_load.COMPARATOR, values, k, geometry=(width, length))
+        lines = decks.elements(light_load.COMPARATOR, values, k, geometry=(width, length))
         control = ["op", "let vcomp=v(comp)", "print vcomp"]
         options = "reltol=1e-7 abstol=1e-15 vntol=1e-9 itl1=500"
-        found = ngspice.run(ngspice.deck("trip", lines, control, options=options))
+        found = ngspice.run(decks.deck("trip", lines, control, options=options))
         assert schematic.V_REF - found["vcomp"] == pytest.approx(float(offset[k]), abs=1e-6)
 
 

@@ -5,7 +5,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure import rev_argate
+from failure import feature_ranking, rev_argate
 from failure.bnn import BNNConfig
 from failure.models.acquisition import AcquisitionConfig
 from failure.search import bayesopt, runs, spaces
@@ -70,7 +70,7 @@ def test_weights_sum_to_one_and_rank_the_features(trained):
     params, _, x, _ = trained
     weights = rev_argate.fusion_weights(CONFIG, params, x)
     np.testing.assert_allclose(weights.sum(1), 1.0, rtol=1e-5)
-    order, n_active = rev_argate.active_features(weights, 0.8)
+    order, n_active = feature_ranking.active_features(weights, 0.8)
     mean = np.asarray(weights).mean(0)
     assert np.all(np.diff(mean[order]) <= 0)
     assert mean[order[:n_active]].sum() >= 0.8 > mean[order[: n_active - 1]].sum()

@@ -7,8 +7,9 @@ import pytest
 
 from failure.search import runs
 from failure.search.methods import SearchConfig
-from failure.search.storage import identity_of, load_tree, samples, save_tree
+from failure.search.storage import identity_of, samples
 from failure.search.task import Task
+from failure.search.trees import load_tree, save_tree
 from failure.status import Status
 
 TASK = Task("box", 3.0, 3)

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 from scipy.stats import norm
 
-from failure.worst_case import Archive, BudgetSpentError, find_regions
+from failure.archive import Archive, BudgetSpentError
+from failure.worst_case import find_regions
 from failure.yield_analysis import Analysis, AnalysisConfig, analyse
 from failure.yields import normal_draws
 

@@ -9,7 +9,7 @@ from pathlib import Path
 import pytest
 
 from failure.circuits.buck import schematic
-from failure.circuits.ldo import regulator
+from failure.circuits.ldo import schematic as ldo
 from snn_fusion_failure.documentation import architecture, diagrams, imports, schematics, svg
 
 
@@ -43,7 +43,7 @@ def test_drawings_are_whole(name: str) -> None:
 
 def test_every_element_of_a_netlist_is_drawn() -> None:
     shown = schematics.ldo()
-    for element in regulator.NETLIST.elements:
+    for element in ldo.NETLIST.elements:
         assert element.name in schematics.SUPPLIES or f">{element.name}<" in shown
     shown = schematics.buck()
     for transistor in schematic.MOSFETS:
@@ -54,7 +54,7 @@ def test_an_element_without_a_place_is_refused() -> None:
     places = {k: v for k, v in schematics.LDO.items() if k != "MP"}
     canvas = svg.Canvas(10, 10, "x")
     with pytest.raises(ValueError, match=r"\['MP'\] stand in the netlist or here only"):
-        schematics.draw_block(canvas, regulator.NETLIST.elements, places, 0, 0)
+        schematics.draw_block(canvas, ldo.NETLIST.elements, places, 0, 0)
 
 
 def test_uses_of_sub_rooms_are_read_off_the_imports() -> None:

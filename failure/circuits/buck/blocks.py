@@ -71,20 +71,22 @@ class Amplifier(NamedTuple):
 
 
 @lru_cache(maxsize=4)
-def _systems(model: str) -> tuple[System, System]:
-    return compile_netlist(AMPLIFIER, model), compile_netlist(POWER, model)
+def _systems(model: str, dense: bool) -> tuple[System, System]:
+    amplifier, power = (compile_netlist(n, model, dense=dense) for n in (AMPLIFIER, POWER))
+    return amplifier, power
 
 
-def amplifier(u: Float[Array, "5 2 b"], *, model: str = "ekv") -> Amplifier:
+def amplifier(u: Float[Array, "5 2 b"], *, model: str = "ekv", dense: bool = False) -> Amplifier:
     """Offset current, transconductance and output conductance by three DC points.
 
     Args:
         u: parameters of the five transistors in sigma.
         model: MOSFET model.
+        dense: see `System.dense`.
     Returns:
         Amplifier.
     """
-    system, _ = _systems(model)
+    system, _ = _systems(model, dense)
     batch = u.shape[-1]
     values = variation(system, AMPLIFIER_MOSFETS, jnp.tile(u, (1, 1, 3)))
     d_fb, d_comp = 10e-3, 30e-3
@@ -112,7 +114,9 @@ class Edges(NamedTuple):
     status: Int[Array, "b"]
 
 
-def edges(u: Float[Array, "17 2 b"], *, model: str = "ekv", refine: int = 1) -> Edges:
+def edges(
+    u: Float[Array, "17 2 b"], *, model: str = "ekv", refine: int = 1, dense: bool = False
+) -> Edges:
     """Delays and on resistances by a transient of comparator, drivers and switches.
 
     The instant of an edge is that of the ideal step with the same volt-seconds.
@@ -121,10 +125,11 @@ def edges(u: Float[Array, "17 2 b"], *, model: str = "ekv", refine: int = 1) -> 
         u: parameters of the 17 transistors in sigma.
         model: MOSFET model.
         refine: divides every time step.
+        dense: see `System.dense`.
     Returns:
         Edges.
     """
-    _, system = _systems(model)
+    _, system = _systems(model, dense)
     time = edge_grid(refine)
     values = variation(system, POWER_MOSFETS, u)
     ramp = np.interp(time.t, _EDGE_T, _EDGE_V)

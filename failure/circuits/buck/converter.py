@@ -46,7 +46,12 @@ SPECS = (
 
 
 def solve_dcdc(
-    x: Float[Array, "d b"], *, model: str = "ekv", refine: int = 1, points: int = 8
+    x: Float[Array, "d b"],
+    *,
+    model: str = "ekv",
+    refine: int = 1,
+    points: int = 8,
+    dense: bool = False,
 ) -> tuple[Float[Array, "m b"], Int[Array, "b"]]:
     """Specifications of a batch of samples, batch last.
 
@@ -55,14 +60,15 @@ def solve_dcdc(
         model: MOSFET model.
         refine: divides the time steps of the edge transient.
         points: output samples in each half period.
+        dense: a program that is quicker to compile and slower to run, for gradients.
     Returns:
         (specs `[2, b]` in the order of `SPECS`, status `[b]`).
     """
     batch = x.shape[-1]
     u = x.reshape(len(MOSFETS), 2, batch)
     n_amp = len(AMPLIFIER_MOSFETS)
-    amp = amplifier(u[:n_amp], model=model)
-    edge = edges(u[n_amp:], model=model, refine=refine)
+    amp = amplifier(u[:n_amp], model=model, dense=dense)
+    edge = edges(u[n_amp:], model=model, refine=refine, dense=dense)
     one = jnp.ones((batch,), x.dtype)
     stage = Stage(
         INDUCTANCE * one, CAPACITANCE * one, R_COIL * one, R_ESR * one, R_COMP * one,

@@ -8,6 +8,7 @@ import numpy as np
 
 from failure.circuits.buck import schematic
 from failure.circuits.solver import ngspice
+from failure.circuits.solver.decks import sample_decks
 from failure.circuits.solver.netlist import (
     Capacitor,
     CurrentSource,
@@ -62,8 +63,6 @@ def dcdc_decks(
         )
     values = jax.tree.map(np.asarray, values)
     (_, _, s_length), (_, _, s_width) = schematic.QUANTITIES
-    width = np.array([[m.width] for m in schematic.MOSFETS]) * (1.0 + s_width * u[:, 1])
-    length = np.array([[m.length] for m in schematic.MOSFETS]) * (1.0 + s_length * u[:, 0])
     load = (
         (0.0, schematic.LOAD_HEAVY),
         (_T_STEP, schematic.LOAD_HEAVY),
@@ -83,19 +82,15 @@ def dcdc_decks(
         "print vmean",
         "print vpeak",
     ]
-    return [
-        ngspice.deck(
-            "BUCK",
-            own
-            + ngspice.elements(
-                FULL, values, k, geometry=(width, length), model=model, waves={"Iload": load}
-            ),
-            control,
-            options=f"reltol={reltol!r}",
-            extra=".ic v(out)=1.2 v(comp)=1.2 v(lx)=1.2 v(fb)=1.2 v(oe)=0 v(cz)=1.2",
-        )
-        for k in range(len(x))
-    ]
+    return sample_decks(
+        "BUCK", FULL, values, control,
+        stretch=np.stack([1.0 + s_width * u[:, 1], 1.0 + s_length * u[:, 0]]),
+        model=model,
+        waves={"Iload": load},
+        own=own,
+        options=f"reltol={reltol!r}",
+        extra=".ic v(out)=1.2 v(comp)=1.2 v(lx)=1.2 v(fb)=1.2 v(oe)=0 v(cz)=1.2",
+    )  # fmt: skip
 
 
 def dcdc_reference(

@@ -6,7 +6,7 @@ import jax
 import jax.numpy as jnp
 import numpy as np
 
-from failure.circuits.ldo.regulator import (
+from failure.circuits.ldo.schematic import (
     I_HEAVY,
     I_LIGHT,
     KNEE,
@@ -18,7 +18,7 @@ from failure.circuits.ldo.regulator import (
     variation,
 )
 from failure.circuits.solver import ngspice
-from failure.circuits.solver.netlist import Mosfet
+from failure.circuits.solver.decks import sample_decks
 from failure.circuits.solver.system import compile_netlist
 
 _STEP = ((0.0, I_LIGHT), (T_STEP, I_LIGHT), (T_STEP + T_RISE, I_HEAVY), (1.0, I_HEAVY))
@@ -40,11 +40,8 @@ def ldo_decks(
     with jax.enable_x64(True):
         values = variation(compile_netlist(NETLIST, "level1"), jnp.asarray(x.T, jnp.float64))
     values = jax.tree.map(np.asarray, values)
-    mosfets = NETLIST.of(Mosfet)
-    width = np.array([[m.width] for m in mosfets])
-    length = np.array([[m.length] for m in mosfets]) * (
-        1.0 + QUANTITIES[0][2] * np.asarray(x, np.float64).reshape(len(x), -1, 3)[:, :, 0].T
-    )
+    # Length alone of what a transistor's drawing says is varied.
+    length = 1.0 + QUANTITIES[0][2] * np.asarray(x, np.float64).reshape(len(x), -1, 3)[:, :, 0].T
     control = [
         "op",
         f"let iq=-i(v_vin)-{I_LIGHT!r}*tanh(v(out)/{KNEE!r})",
@@ -61,22 +58,13 @@ def ldo_decks(
         "let vheavy=v(out)",
         "print vheavy",
     ]
-    return [
-        ngspice.deck(
-            "LDO",
-            ngspice.elements(
-                NETLIST,
-                values,
-                k,
-                geometry=(width, length),
-                model=model,
-                waves={"Bload": _STEP},
-            ),
-            control,
-            options=f"reltol={reltol!r} abstol=1e-15 vntol=1e-9",
-        )
-        for k in range(len(x))
-    ]
+    return sample_decks(
+        "LDO", NETLIST, values, control,
+        stretch=np.stack([np.ones_like(length), length]),
+        model=model,
+        waves={"Bload": _STEP},
+        options=f"reltol={reltol!r} abstol=1e-15 vntol=1e-9",
+    )  # fmt: skip
 
 
 def ldo_reference(

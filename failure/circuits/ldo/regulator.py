@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-import math
+import dataclasses
 from functools import lru_cache
 from typing import NamedTuple
 
@@ -11,88 +11,35 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
+from failure.circuits.ldo.schematic import (
+    I_HEAVY,
+    I_LIGHT,
+    KNEE,
+    NETLIST,
+    T_END,
+    T_RISE,
+    T_STEP,
+    variation,
+)
 from failure.circuits.protocol import Spec
 from failure.circuits.solver.mna import source_current
-from failure.circuits.solver.mosfet import NMOS, PMOS, mos_params
 from failure.circuits.solver.netlist import (
-    Capacitor,
-    CurrentSource,
-    Load,
-    Mosfet,
     Netlist,
-    Resistor,
-    VoltageSource,
 )
-from failure.circuits.solver.newton import dc
+from failure.circuits.solver.newton import Solution, dc
 from failure.circuits.solver.system import System, compile_netlist
 from failure.circuits.solver.transient import Grid, grid, transient
 from failure.circuits.solver.values import Values, nominal_values
 from failure.status import Status
 
-KNEE = 1.0
-"""Voltage scale of the load [V]: it draws `amps * tanh(v / KNEE)`, less as the output falls."""
-
-I_LIGHT = 1e-3 / math.tanh(1.0 / KNEE)
-I_HEAVY = 150e-3 / math.tanh(1.0 / KNEE)
-"""Load before and after the step [A]: 1 mA and 150 mA at 1 V."""
-
-T_STEP, T_RISE, T_END = 10e-9, 1e-9, 120e-9
-"""Start and length of the load step, end of the transient [s]."""
-
 T_DAMPED = 40e-9
 """From here on the steps of the shipped grid are longer than 4 ns [s]."""
 
-QUANTITIES = (("length", "relative", 0.01), ("vth", "V", 5e-3), ("tox", "relative", 0.007))
-"""Varied quantities of each transistor: name, unit of sigma, sigma."""
 
 SPECS = (
     Spec("quiescent_current", "A", "max", "supply current at the light load, load excluded"),
     Spec("undershoot", "V", "max", "output before the load step less its minimum after it"),
     Spec("load_regulation", "%", "max", "fall of the output from light to heavy load, DC"),
-)
-
-
-def _n(name: str, d: str, g: str, s: str, width: int | float, length: float) -> Mosfet:
-    return Mosfet(name, d, g, s, "0", NMOS, width * 1e-6, length * 1e-6)
-
-
-def _p(name: str, d: str, g: str, s: str, width: int | float, length: float) -> Mosfet:
-    return Mosfet(name, d, g, s, "vin", PMOS, width * 1e-6, length * 1e-6)
-
-
-NETLIST = Netlist(
-    "LDO",
-    (
-        VoltageSource("Vin", "vin", "0", 2.2),
-        VoltageSource("Vref", "ref", "0", 1.0),
-        CurrentSource("Iref", "vin", "nb", 150e-6),
-        # Bias: reference diode, tail, p-side mirror, source of the buffer, keepers of the output.
-        _n("MB1", "nb", "nb", "0", 27, 0.5),
-        _n("MB2", "tail", "nb", "0", 280, 0.5),
-        _n("MB3", "pb", "nb", "0", 27, 0.5),
-        _p("MB4", "pb", "pb", "vin", 80, 0.5),
-        _p("MB5", "gp", "pb", "vin", 820, 0.5),
-        _n("MB6", "out", "x", "0", 40, 0.5),
-        _n("MB7", "out", "nb", "0", 54, 0.5),
-        # Error amplifier: current-mirror OTA, output loaded by two diodes.
-        _n("M1", "d1", "out", "tail", 60, 0.35),
-        _n("M2", "d2", "ref", "tail", 60, 0.35),
-        _p("M3", "d1", "d1", "vin", 200, 0.35),
-        _p("M4", "d2", "d2", "vin", 200, 0.35),
-        _p("M5", "ga", "d1", "vin", 400, 0.35),
-        _p("M6", "d7", "d2", "vin", 400, 0.35),
-        _n("M7", "d7", "d7", "0", 200, 0.35),
-        _n("M8", "ga", "d7", "0", 200, 0.35),
-        _p("M9", "ga", "ga", "vin", 20, 0.35),
-        _n("M10", "ga", "ga", "0", 4, 0.35),
-        # Follower buffer, its current sensed by M13 and turned into a pull-down at the output.
-        _p("M11", "x", "ga", "gp", 1500, 0.35),
-        _n("M13", "x", "x", "0", 200, 0.5),
-        _p("MP", "out", "gp", "vin", 6000, 0.35),
-        Capacitor("Cout", "out", "oesr", 0.4e-9),
-        Resistor("Resr", "oesr", "0", 0.1),
-        Load("Bload", "out", "0", I_LIGHT, KNEE),
-    ),
 )
 
 
@@ -124,35 +71,12 @@ RESOLVED = 2e-3
 
 class _Setup(NamedTuple):
     system: System
+    short: System
     light: np.ndarray
     heavy: np.ndarray
 
 
-def variation(
-    system: System, x: Float[Array, "d b"], sigmas: tuple[float, float, float] | None = None
-) -> Values:
-    """Element values of samples given in sigma, transistor-major `(length, vth, tox)`."""
-    sigma_l, sigma_v, sigma_t = sigmas or tuple(s for _, _, s in QUANTITIES)
-    mosfets = system.netlist.of(Mosfet)
-    u = x.reshape(len(mosfets), 3, x.shape[-1])
-
-    def column(values: list[float]) -> Array:
-        return jnp.array(values, x.dtype).reshape(-1, 1)
-
-    mos = mos_params(
-        column([m.process.polarity for m in mosfets]),
-        column([m.process.mobility for m in mosfets]),
-        column([m.process.early for m in mosfets]),
-        column([m.process.overlap for m in mosfets]),
-        width=column([m.width for m in mosfets]),
-        length=column([m.length for m in mosfets]) * (1.0 + sigma_l * u[:, 0]),
-        vto=column([m.process.vto for m in mosfets]) + sigma_v * u[:, 1],
-        tox=column([m.process.tox for m in mosfets]) * (1.0 + sigma_t * u[:, 2]),
-    )
-    return nominal_values(system)._replace(mos=mos)
-
-
-def _loaded(values: Values, amps: float) -> Values:
+def _loaded(values: Values, amps: float | Array) -> Values:
     return values._replace(load=jnp.full_like(values.load, amps))
 
 
@@ -160,23 +84,31 @@ def _loaded(values: Values, amps: float) -> Values:
 def _setup(model: str, netlist: Netlist = NETLIST) -> _Setup:
     """Compiled netlist and its nominal operating points, where Newton starts."""
     system = compile_netlist(netlist, model)
+    short = dataclasses.replace(system, dense=True)
     with jax.ensure_compile_time_eval(), jax.enable_x64(True):
         values = nominal_values(system)
 
-        @jax.jit
-        def points() -> tuple[Array, Array, Array]:
-            light = dc(system, _loaded(values, I_LIGHT))
-            heavy = dc(system, _loaded(values, I_HEAVY), light.v)
-            return light.v, heavy.v, light.status + heavy.status
+        def solve(amps: Array, start: Array) -> Solution:
+            return dc(short, _loaded(values, amps), start)
 
-        light, heavy, status = (np.asarray(a) for a in points())
+        # It runs twice: what the compiler would optimise is not worth its time.
+        point = jax.jit(solve, compiler_options={"xla_backend_optimization_level": 0})
+        first = point(jnp.asarray(I_LIGHT), jnp.zeros((system.n, 1)))
+        second = point(jnp.asarray(I_HEAVY), first.v)
+        light, heavy = np.asarray(first.v), np.asarray(second.v)
+        status = np.asarray(first.status + second.status)
     if status[0]:
         raise RuntimeError(f"{netlist.title}: the nominal circuit has no operating point")
-    return _Setup(system, light, heavy)
+    return _Setup(system, short, light, heavy)
 
 
 def solve_ldo(
-    x: Float[Array, "d b"], *, model: str = "ekv", time: Grid = TIME, netlist: Netlist = NETLIST
+    x: Float[Array, "d b"],
+    *,
+    model: str = "ekv",
+    time: Grid = TIME,
+    netlist: Netlist = NETLIST,
+    dense: bool = False,
 ) -> tuple[Float[Array, "m b"], Int[Array, "b"]]:
     """Specifications of a batch of samples, batch last.
 
@@ -185,11 +117,13 @@ def solve_ldo(
         model: MOSFET model.
         time: grid of the transient.
         netlist: the circuit as drawn.
+        dense: a program that is quicker to compile and slower to run, for gradients.
     Returns:
         (specs `[3, b]` in the order of `SPECS`, status `[b]`: `NOT_CONVERGED` also where the steps
         do not resolve the dip to `RESOLVED`).
     """
-    system, light0, heavy0 = _setup(model, netlist)
+    usual, short, light0, heavy0 = _setup(model, netlist)
+    system = short if dense else usual
     values = variation(system, x)
     at_light, at_heavy = _loaded(values, I_LIGHT), _loaded(values, I_HEAVY)
     light = dc(system, at_light, jnp.asarray(light0))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Float
 
 from failure.circuits.solver.system import System
@@ -13,6 +14,31 @@ Entries = dict[tuple[int, int], Array]
 def add_entry(entries: Entries, i: int, j: int, value: Array) -> None:
     """Add to an entry of a sparse matrix in place."""
     entries[i, j] = entries[i, j] + value if (i, j) in entries else value
+
+
+def full_matrix(system: System, entries: Entries, batch: int) -> Float[Array, "n n b"]:
+    """The matrix with its zeros."""
+    zero = jnp.zeros((batch,), next(iter(entries.values())).dtype)
+    rows = [entries.get((i, j), zero) for i in range(system.n) for j in range(system.n)]
+    return jnp.stack(rows).reshape(system.n, system.n, batch)
+
+
+def eliminate_full(
+    system: System, entries: Entries, rhs: Float[Array, "n b"]
+) -> Float[Array, "n b"]:
+    """The same as `eliminate` on the full matrix, row by row: a short program."""
+    order = np.asarray(system.order)
+    a, b = full_matrix(system, entries, rhs.shape[-1])[order][:, order], rhs[order]
+    rows: list[tuple[Array, Array, Array]] = []
+    for _ in range(system.n):
+        inverse = 1.0 / a[0, 0]
+        rows.append((inverse, a[0, 1:], b[0]))
+        factor = a[1:, 0] * inverse[None]
+        a, b = a[1:, 1:] - factor[:, None] * a[0, 1:][None], b[1:] - factor * b[:1]
+    x = rhs[:0]
+    for inverse, row, value in reversed(rows):
+        x = jnp.concatenate([((value - jnp.sum(row * x, axis=0)) * inverse)[None], x])
+    return x[np.argsort(order)]
 
 
 def eliminate(system: System, entries: Entries, rhs: Float[Array, "n b"]) -> Float[Array, "n b"]:
@@ -27,6 +53,8 @@ def eliminate(system: System, entries: Entries, rhs: Float[Array, "n b"]) -> Flo
     Deviation: LU with partial pivoting is safer; nodal matrices with gmin on the diagonal do not
         need it here, and a small pivot shows up as a sample that does not converge.
     """
+    if system.dense:
+        return eliminate_full(system, entries, rhs)
     a = dict(entries)
     b = [rhs[i] for i in range(system.n)]
     done: set[int] = set()

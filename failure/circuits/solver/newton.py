@@ -10,7 +10,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float, Int
 
-from failure.circuits.solver.elimination import eliminate
+from failure.circuits.solver.elimination import eliminate, full_matrix
 from failure.circuits.solver.mna import Stamps, keys, residual, stamps
 from failure.circuits.solver.system import System
 from failure.circuits.solver.values import Values, batch_size
@@ -143,9 +143,11 @@ def _newton_jvp(
     s, v0 = primals
     ds, _ = tangents
     v, last = newton(system, max_iterations, stages, s, v0)
-    _, df = jax.jvp(lambda q: residual(system, q, v)[0], (s,), (ds,))
-    _, jacobian = residual(system, s, v)
-    dv = -eliminate(system, jacobian, df)
+    _, df, jacobian = jax.jvp(lambda q: residual(system, q, v), (s,), (ds,), has_aux=True)
+    # A dense solve, one per sample: its transpose is one call too, where the sparse elimination
+    # backwards would be a program of many thousand operations that takes minutes to compile.
+    matrix = full_matrix(system, jacobian, v.shape[-1]).transpose(2, 0, 1)
+    dv = -jnp.linalg.solve(matrix, df.T[:, :, None])[:, :, 0].T
     return (v, last), (dv, jnp.zeros_like(last))
 
 

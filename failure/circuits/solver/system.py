@@ -43,6 +43,8 @@ class System:
     """Elimination order of the unknowns."""
     fixed_by: Mapping[str, int]
     """Fixed node -> index of its voltage source."""
+    dense: bool = False
+    """Eliminate the full matrix: slower to run, several times quicker to compile."""
 
     @property
     def n(self) -> int:
@@ -68,12 +70,13 @@ class System:
         return names.index(node)
 
 
-def compile_netlist(netlist: Netlist, model: str = "ekv") -> System:
+def compile_netlist(netlist: Netlist, model: str = "ekv", *, dense: bool = False) -> System:
     """Number the unknowns of a netlist and choose the elimination order.
 
     Args:
         netlist: the circuit.
         model: MOSFET model, "ekv" or "level1".
+        dense: for programs that are compiled to run a few times, as gradients are.
     Returns:
         System.
     Raises:
@@ -91,7 +94,7 @@ def compile_netlist(netlist: Netlist, model: str = "ekv") -> System:
     currents = [f"{b.name}#branch" for b in branches(netlist)]
     free = [n for n in netlist.nodes() if n != GROUND and n not in fixed]
     system = System(netlist, model, (*free, *currents), (*fixed, GROUND), (), fixed)
-    return System(netlist, model, system.unknowns, system.known, _order(system), fixed)
+    return System(netlist, model, system.unknowns, system.known, _order(system), fixed, dense)
 
 
 def _order(system: System) -> tuple[int, ...]:

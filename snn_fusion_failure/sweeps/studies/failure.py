@@ -17,7 +17,8 @@ import jax.numpy as jnp
 
 from failure import circuits
 from failure.models import acquisition, gp, gp_fit
-from failure.models.optimize import Domain, box, sample
+from failure.models.candidates import raw_points
+from failure.models.domains import Domain, box, sample
 from snn_fusion_failure.sweeps.study import Carry, Metric, Study
 
 
@@ -84,9 +85,7 @@ def make(
                 jnp.maximum(-half, u[top[0]] - reach), jnp.minimum(half, u[top[0]] + reach),
                 jnp.asarray(jnp.inf),
             )  # fmt: skip
-            points = acquisition.raw_points(
-                local, u[top], candidates, key=jax.random.fold_in(key, n)
-            )
+            points = raw_points(local, u[top], candidates, key=jax.random.fold_in(key, n))
             mean, variance = gp.predict(config, posterior, points)
             value = acquisition.weighted(mean, jnp.sqrt(variance), jnp.asarray(params.weight))
             point = points[jnp.argmax(value)]

@@ -69,6 +69,7 @@ def test_guided_lines_say_what_they_do_not_know() -> None:
         guided_lines(lambda x: x[:, 0], 1.0, DIM, key=KEY, factor=0.5)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("gradients", [False, True])
 def test_refined_importance_sampling_stops_by_itself_and_covers(gradients) -> None:
     problem = make_problem("bent", 1e-9, DIM)
@@ -80,6 +81,7 @@ def test_refined_importance_sampling_stops_by_itself_and_covers(gradients) -> No
     assert (found.n_gradients == found.estimate.n_simulations) == gradients
 
 
+@pytest.mark.slow
 def test_refined_importance_sampling_says_when_the_budget_ends() -> None:
     problem = make_problem("bent", 1e-9, DIM)
     short = ak_sampling(compiled(problem), problem.threshold, DIM, key=KEY, most=DIM + 16)

@@ -95,7 +95,7 @@ def remaining_way(way: WayLength, x: Float[Array, ""], y: Float[Array, ""]) -> F
     u = jnp.clip((x - way.origin[0]) / way.cell, 0.0, columns - 1.001)
     v = jnp.clip((y - way.origin[1]) / way.cell, 0.0, rows - 1.001)
     i, j = jnp.floor(u).astype(jnp.int32), jnp.floor(v).astype(jnp.int32)
-    a, b = u - i, v - j
+    a, b = u - jnp.floor(u), v - jnp.floor(v)
     low = (1.0 - b) * way.lengths[i, j] + b * way.lengths[i, j + 1]
     high = (1.0 - b) * way.lengths[i + 1, j] + b * way.lengths[i + 1, j + 1]
     return (1.0 - a) * low + a * high

@@ -16,6 +16,7 @@ PACKAGES = {
 BY_PATH = {
     "jaxsnn.brax_env": "robots as environments of brax, and what brax needs to run them",
     "jaxsnn.drivers": "drivers that do not learn, for comparison",
+    "jaxsnn.map_files": "maps from files",
     "jaxsnn.navigation": "the robot as a task for PPO",
     "jaxsnn.ppo": "proximal policy optimisation",
     "jaxsnn.plots": "pictures (matplotlib)",
@@ -36,6 +37,7 @@ BY_PATH = {
     "failure.yield_analysis": "yield of a circuit with several specifications",
     "failure.simulators": "netlists of one's own: decks, variations, limits, corners",
     "failure.plots": "pictures (matplotlib)",
+    "snn_fusion_failure.commands.train_snn": "the command that trains robots, called from Python",
 }
 """Module that the documentation shows by its full path -> what it is for; not promised."""
 

@@ -56,6 +56,7 @@ def test_a_point_under_way_is_not_asked_again() -> None:
     assert np.linalg.norm(second - first) > 1e-2
 
 
+@pytest.mark.slow
 def test_workers_do_not_wait_for_the_slowest(tmp_path) -> None:
     """One simulation lasts until twenty others have ended: in batches it would last forever."""
     lock, others = threading.Lock(), threading.Event()

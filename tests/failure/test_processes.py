@@ -25,7 +25,7 @@ spec = importlib.util.spec_from_file_location("processes", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 sys.modules["processes"] = module
 spec.loader.exec_module(module)
-module.Group().run(["sh", "-c", sys.argv[2]], timeout=300.0)
+module.Group().run(["sh", "-c", sys.argv[2]], timeout=1200.0)
 """
 
 
@@ -109,7 +109,7 @@ def test_worker_processes_of_a_function_end_with_the_parent(tmp_path: Path) -> N
     code = (
         "import numpy as np, tests.failure.test_processes as t\n"
         "if __name__ == '__main__':\n"
-        "    t.FunctionSimulator(t.hang, 1, timeout=300)(np.zeros((1, 1)))\n"
+        "    t.FunctionSimulator(t.hang, 1, timeout=1200)(np.zeros((1, 1)))\n"
     )
     script = tmp_path / "parent.py"
     script.write_text(code)

@@ -94,8 +94,9 @@ def remaining_way(way: WayLength, x: Float[Array, ""], y: Float[Array, ""]) -> F
     columns, rows = way.lengths.shape
     u = jnp.clip((x - way.origin[0]) / way.cell, 0.0, columns - 1.001)
     v = jnp.clip((y - way.origin[1]) / way.cell, 0.0, rows - 1.001)
-    i, j = jnp.floor(u).astype(jnp.int32), jnp.floor(v).astype(jnp.int32)
-    a, b = u - jnp.floor(u), v - jnp.floor(v)
+    left, bottom = jnp.floor(u), jnp.floor(v)
+    i, j = left.astype(jnp.int32), bottom.astype(jnp.int32)
+    a, b = u - left, v - bottom
     low = (1.0 - b) * way.lengths[i, j] + b * way.lengths[i, j + 1]
     high = (1.0 - b) * way.lengths[i + 1, j] + b * way.lengths[i + 1, j + 1]
     return (1.0 - a) * low + a * high

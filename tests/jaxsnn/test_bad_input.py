@@ -69,14 +69,9 @@ CALLS = {
 PROGRAM = """
 import json, sys
 import jax, jax.numpy as jnp
-import importlib, pkgutil, jaxsnn
-for found in pkgutil.iter_modules(jaxsnn.__path__):
-    if found.name not in ("brax_env", "gym_env", "plots"):
-        module = importlib.import_module("jaxsnn." + found.name)
-        globals().update({k: v for k, v in vars(module).items() if not k.startswith("_")})
 from jaxsnn import *
 from jaxsnn import maps, network, world
-import json, sys, jax, jax.numpy as jnp
+from jaxsnn.config import Weights
 room = maps.make_map(target=(300, 300), starts=[(100, 300, 20)])
 keys = jax.random.split(jax.random.key(0), 1)
 w, w2 = jnp.ones(1), jnp.ones((4, 1))

@@ -17,6 +17,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.records.rows import recorded
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -142,9 +143,7 @@ def main(config: Config) -> dict[str, Any]:
     circuit = circuits.get(config.circuit)
     names = config.specs or circuit.spec_names
     path = config.record
-    held: list[dict[str, Any]] = []
-    if path.exists():
-        held = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    held = recorded(path)
     rows = []
     for column in [circuit.spec_index(name) for name in names]:
         row = {**study(config, circuit, column), **provenance()}

@@ -19,11 +19,10 @@ two CPU-minutes per row, a network about 10 CPU-seconds per seed and row.
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from typing import Any
 
-from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.rows import record_table, recorded, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, progress, repository, run_command
 from snn_fusion_failure.runs.origin import check_recordable
 
@@ -261,11 +260,7 @@ def main(config: Study) -> dict[str, float]:
     check_recordable()
     enable_compilation_cache()
     path = repository.RESULTS / "study_detour.json"
-    held = set()
-    if path.exists():
-        for cell in json.loads(path.read_text(encoding="utf-8"))["rows"]:
-            if cell["n"] >= config.seeds:
-                held.add((cell["model"], cell["row"], cell["metric"]))
+    held = {(r["model"], r["row"], r["metric"]) for r in recorded(path) if r["n"] >= config.seeds}
     metric = "sr_testing" if config.learn_trials == 20 else "sr_testing_60_trials"
     cells = [(m, r) for m in config.models for r in config.rows if (m, r, metric) not in held]
     start, found = time.process_time(), {}

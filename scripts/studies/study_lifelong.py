@@ -15,11 +15,10 @@ are skipped when they are there with as many seeds. About 30 CPU-seconds per rob
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from typing import Any
 
-from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.rows import record_table, recorded, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     progress,
@@ -138,11 +137,7 @@ def main(config: Study) -> dict[str, float]:
     check_recordable()
     enable_compilation_cache()
     path = repository.RESULTS / "study_lifelong.json"
-    held = set()
-    if path.exists():
-        for cell in json.loads(path.read_text(encoding="utf-8"))["rows"]:
-            if cell["n"] >= config.seeds:
-                held.add((cell["model"], cell["row"]))
+    held = {(r["model"], r["row"]) for r in recorded(path) if r["n"] >= config.seeds}
     cells = [(m, r) for m in config.models for r in config.rows if (m, r) not in held]
     start, found = time.process_time(), {}
     with progress() as bar:

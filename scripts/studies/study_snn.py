@@ -12,13 +12,12 @@ skipped, so a study can be broken off and gone on with. About 3 CPU-seconds per 
 from __future__ import annotations
 
 import dataclasses
-import json
 import time
 from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.rows import record_table, recorded, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, repository, run_command
 from snn_fusion_failure.runs.networks import changed_preset
 
@@ -114,11 +113,11 @@ def main(config: Study) -> dict[str, Any]:
         raise ValueError(f"only={sorted(unknown)}: expected some of {sorted(variants)}; choose")
     enable_compilation_cache()
     path = repository.RESULTS / f"study_snn_{config.study}.json"
-    held = set()
-    if path.exists():
-        for row in json.loads(path.read_text(encoding="utf-8"))["rows"]:
-            if row["metric"] == "sr_testing" and row["n"] >= config.seeds:
-                held.add((row["row"], row["model"]))
+    held = {
+        (r["row"], r["model"])
+        for r in recorded(path)
+        if r["metric"] == "sr_testing" and r["n"] >= config.seeds
+    }
     model = f"{config.model} scenario {config.scenario}"
     done: dict[str, float] = {}
     runners: dict[Any, Any] = {}

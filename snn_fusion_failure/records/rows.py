@@ -24,6 +24,14 @@ def summarize(values: Sequence[float]) -> dict[str, Any]:
     return {"n": len(values), "mean": found.mean, "ci95": [found.low, found.high], "values": values}
 
 
+def recorded(path: Path) -> list[dict[str, Any]]:
+    """Rows of a table of record; none where it has not been written."""
+    if not path.exists():
+        return []
+    rows: list[dict[str, Any]] = json.loads(path.read_text(encoding="utf-8"))["rows"]
+    return rows
+
+
 def record_table(
     path: Path, table: str, title: str, rows: Iterable[dict[str, Any]], *, preset: str
 ) -> None:
@@ -47,15 +55,12 @@ def record_table(
             kept_in = Path("runs") / "refused" / path.name
             write_json(kept_in, {"table": table, "title": title, "preset": preset, "rows": rows})
             raise ValueError(f"{error}; the rows are kept in {kept_in}") from error
-    held: list[dict[str, Any]] = []
-    if path.exists():
-        held = json.loads(path.read_text(encoding="utf-8"))["rows"]
 
     def key(row: dict[str, Any]) -> tuple[Any, ...]:
         return row["row"], row["model"], row["metric"]
 
     new = {key(row) for row in rows}
-    kept = [row for row in held if key(row) not in new]
+    kept = [row for row in recorded(path) if key(row) not in new]
     write_json(
         path,
         {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows},

@@ -19,10 +19,11 @@ from jaxsnn.config import NetworkConfig, NetworkParams
 from jaxsnn.drivers import drive
 from jaxsnn.encoding import poisson_spikes
 from jaxsnn.experiment import run_experiment
-from jaxsnn.maps import make_map, random_map
+from jaxsnn.maps import make_map
 from jaxsnn.neurons import LIFParams, lif_init, lif_scan, lif_step
 from jaxsnn.plasticity import STDPParams, apply_reward, stdp_init, stdp_step
 from jaxsnn.presets import preset
+from jaxsnn.random_maps import random_map
 from jaxsnn.scenarios import detour, scenario
 from jaxsnn.status import Status
 from jaxsnn.trials import run_phase, success_rate

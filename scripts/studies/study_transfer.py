@@ -4,7 +4,7 @@
     python scripts/studies/study_transfer.py --study trials --model S4 --seeds 32
 
 `maps`: robots learn for 20 trials on Scenario 1, 2 or 3 and drive, weights frozen, one trial on
-each of 100 random solvable maps that nothing was tuned on (`jaxsnn.maps.random_map`, a key of its
+each of 100 random solvable maps that nothing was tuned on (`jaxsnn.random_map`, a key of its
 own). Rows go to `results/study_snn_maps.json`: success rate per robot over the maps, per map over
 the robots, and path against the shortest one.
 
@@ -64,7 +64,7 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     import jax.numpy as jnp
     import numpy as np
 
-    from jaxsnn import agents, maps, planner, scenarios, trials
+    from jaxsnn import agents, maps, planner, random_maps, scenarios, trials
     from jaxsnn.experiment import learning_circles, phase_keys, run_experiment, seed_keys
     from jaxsnn.presets import preset
     from jaxsnn.status import Status
@@ -72,7 +72,7 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     built, constants = preset(config.model, config.reading)
     map = scenarios.scenario(scenario)
     root = jax.random.key(MAP_KEY)
-    unseen = [maps.random_map(key=jax.random.fold_in(root, i)) for i in range(config.maps)]
+    unseen = [random_maps.random_map(key=jax.random.fold_in(root, i)) for i in range(config.maps)]
     stacked = maps.stack_maps(unseen)
     keys = seed_keys(jnp.arange(config.seeds))
     params = jax.tree.map(jnp.float32, agents.snn_params(built, constants))

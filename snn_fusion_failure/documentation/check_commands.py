@@ -5,13 +5,12 @@
     python scripts/tools/check_commands.py --part 0/3
 
 The commands are those that a reader finds, with the options of the table in
-snn_fusion_failure/documentation/documented.py appended. They run in a copy of the repository in a
-temporary folder, with made-up data sets and simulated KITTI frames, so that the repository and its
-results/ are not touched. Commands of one
-area share a process, as a notebook would: what is imported and compiled once serves the next. One
-line for each with its time; what is not run says why; the log of a command that fails is shown.
-Exit status 1 when one fails. About nine minutes on two cores, after the test suite has compiled.
-"""
+snn_fusion_failure/documentation/command_rules.py appended. They run in a copy of the repository in
+a temporary folder, with made-up data sets and simulated KITTI frames, so that the repository and
+its results/ are not touched. Commands of one area share a process, as a notebook would: what is
+imported and compiled once serves the next. One line for each with its time; what is not run says
+why; the log of a command that fails is shown. Exit status 1 when one fails. About nine minutes on
+two cores, after the test suite has compiled."""
 
 from __future__ import annotations
 
@@ -28,7 +27,7 @@ from concurrent.futures import ThreadPoolExecutor
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.documentation import documented, sample_data
+from snn_fusion_failure.documentation import command_rules, documented, sample_data
 from snn_fusion_failure.documentation.executing import Done, run_area
 from snn_fusion_failure.runs import repository, write_text
 
@@ -52,7 +51,7 @@ class Config:
     """Make the copy here and leave it, with a log for each command."""
 
 
-def missing(rule: documented.Rule) -> str:
+def missing(rule: command_rules.Rule) -> str:
     """The program or package that a command needs and that is not here, in words."""
     name = rule.needs
     if not name or shutil.which(name) or importlib.util.find_spec(name):
@@ -122,7 +121,7 @@ def choose(config: Config) -> tuple[dict[int, documented.Command], dict[int, str
     lacking = [c.text for c in chosen.values() if c.rule is None]
     if lacking:
         raise ValueError(
-            f"snn_fusion_failure/documentation/documented.py has no rule for {lacking[0]!r}"
+            f"snn_fusion_failure/documentation/command_rules.py has no rule for {lacking[0]!r}"
         )
     why = {n: c.rule.not_run or missing(c.rule) for n, c in chosen.items() if c.rule}
     return {n: c for n, c in chosen.items() if not why[n]}, {n: w for n, w in why.items() if w}
@@ -140,7 +139,7 @@ def run_all(config: Config, folder: Path, chosen: dict[int, documented.Command])
             (folder / command.rule.forget).unlink(missing_ok=True)
         if command.rule and command.rule.held:
             write_text(folder / command.rule.held[0], command.rule.held[1])
-    if documented.FUSION_DATA in areas:
+    if command_rules.FUSION_DATA in areas:
         sample_data.make_data(folder / "data")
     finished: list[Done] = []
     lock = threading.Lock()

@@ -56,6 +56,7 @@ TASKS = {
     "jaxsnn.drivers": "The robot's world",
     "jaxsnn.status": "Trials and experiments",
     "jaxsnn.maps": "The robot's world",
+    "jaxsnn.random_maps": "The robot's world",
     "jaxsnn.trials": "Trials and experiments",
     "jaxsnn.experiment": "Trials and experiments",
     "fusion.data": "Data",

@@ -10,7 +10,10 @@ from pathlib import Path
 import pytest
 
 CALLS = {
-    "legacy key": ("maps.random_map(key=jax.random.PRNGKey(0))", "key=<uint32>: expected a typed"),
+    "legacy key": (
+        "random_maps.random_map(key=jax.random.PRNGKey(0))",
+        "key=<uint32>: expected a typed",
+    ),
     "single key": (
         "run_phase(None, None, room, None, keys=jax.random.key(0), n_trials=1, max_steps=1)",
         "expected one key per robot",
@@ -70,7 +73,7 @@ PROGRAM = """
 import json, sys
 import jax, jax.numpy as jnp
 from jaxsnn import *
-from jaxsnn import maps, network, world
+from jaxsnn import maps, network, random_maps, world
 from jaxsnn.config import Weights
 room = maps.make_map(target=(300, 300), starts=[(100, 300, 20)])
 keys = jax.random.split(jax.random.key(0), 1)

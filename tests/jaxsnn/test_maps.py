@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 import shapely
 
-from jaxsnn import maps, planner, world
+from jaxsnn import maps, planner, random_maps, world
 
 BOX = [(350.0, 200.0), (450.0, 200.0), (450.0, 400.0), (350.0, 400.0)]
 FREE: dict[str, Any] = {"target": (700, 300), "starts": [(100, 300, 20)]}
@@ -119,7 +119,7 @@ def test_shortest_path_around_a_box_and_a_circle() -> None:
 
 @pytest.mark.parametrize("seed", range(3))
 def test_random_maps_are_solvable_and_their_paths_are_free(seed: int) -> None:
-    params = maps.random_map(key=jax.random.key(seed))
+    params = random_maps.random_map(key=jax.random.key(seed))
     still = planner.Obstacles.of(params)
     shapes = [shapely.Polygon(loop) for loop in still.loops()]
     assert 4 <= len(shapes) + len(still.circles) <= 8
@@ -139,7 +139,7 @@ def test_random_maps_are_solvable_and_their_paths_are_free(seed: int) -> None:
 
 
 def test_random_map_is_a_function_of_its_key_and_stacks() -> None:
-    one, again, other = (maps.random_map(key=jax.random.key(k)) for k in (3, 3, 4))
+    one, again, other = (random_maps.random_map(key=jax.random.key(k)) for k in (3, 3, 4))
     for a, b in zip(one, again, strict=True):
         np.testing.assert_array_equal(a, b)
     assert not np.array_equal(one.target, other.target)
@@ -150,9 +150,9 @@ def test_random_map_is_a_function_of_its_key_and_stacks() -> None:
 
 def test_random_map_says_when_it_cannot() -> None:
     with pytest.raises(ValueError, match="fewer or smaller obstacles"):
-        maps.random_map(key=jax.random.key(0), min_distance=5000, attempts=20)
+        random_maps.random_map(key=jax.random.key(0), min_distance=5000, attempts=20)
     with pytest.raises(ValueError, match="n_obstacles"):
-        maps.random_map(key=jax.random.key(0), n_obstacles=(5, 2))
+        random_maps.random_map(key=jax.random.key(0), n_obstacles=(5, 2))
     with pytest.raises(ValueError, match="at least one map"):
         maps.stack_maps([])
 

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 import shapely
 
-from jaxsnn import maps, planner, scenarios, world
+from jaxsnn import maps, planner, random_maps, scenarios, world
 
 N = 256
 
@@ -88,7 +88,7 @@ def rollout(steps: int) -> Callable[..., Any]:
 def case(request: pytest.FixtureRequest) -> tuple[world.WorldParams, Any, Any, Any]:
     """A map and a rollout on it; "fast" moves 400 px in a step, over whole obstacles."""
     if request.param == "random":
-        params = maps.random_map(key=jax.random.key(5))
+        params = random_maps.random_map(key=jax.random.key(5))
     elif request.param == "fast":
         params = scenarios.scenario(3)._replace(speed=jnp.float32(400.0))
     else:

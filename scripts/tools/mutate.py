@@ -1,4 +1,4 @@
-"""Break the code in some sixty places, one at a time: do the tests notice?
+"""Break the code in some seventy places, one at a time: do the tests notice?
 
     python scripts/tools/mutate.py
     python scripts/tools/mutate.py --only rewards rank

@@ -56,30 +56,58 @@ class Config:
     seed: int = 0
 
 
-def train(config: Config) -> tuple[FittedARGate, np.ndarray]:
-    """A network and a recording of test windows, `[sample, sensor]` in raw units."""
-    import jax
+def load_stream(config: Config) -> tuple[Any, np.ndarray]:
+    """The data set and a recording of its test windows, `[sample, sensor]` in raw units."""
     import numpy as np
 
-    from fusion import Corruption, finish, fit, load, preset, random_failing, validation_split
+    from fusion import load
 
     data = load(config.dataset, config.data_dir)
     if data.n_time == 1:
         raise ValueError(
             f"dataset={config.dataset!r}: expected simulated or har, whose windows make a stream"
         )
-    held_out = validation_split(data)
-    settings = preset(held_out, "argate_plus", config.preset)
-    protocol = random_failing(data.channels, data.n_channels // 2)
-    noise, key = Corruption(protocol, protocol), jax.random.key(config.seed)
-    state = fit(*settings, held_out, noise, key=key).state
-    fitted = finish(settings.model, state, held_out, noise, key=key)
     # Windows of one person overlap by half in HAR; simulated ones stand alone.
     step = data.n_time // 2 if config.dataset == "har" else data.n_time
     windows = data.test_x[data.test_group == data.test_group[0]][:, :, data.n_time - step :]
     stream = np.concatenate(list(windows), axis=1).T[: config.samples]
     low, high = data.scale.low, data.scale.high
-    return fitted, (stream + 1.0) / 2.0 * (high - low) + low
+    return data, (stream + 1.0) / 2.0 * (high - low) + low
+
+
+def train(config: Config, data: Any) -> FittedARGate:
+    """A network with its monitor and temperature, trained with half of the sensors failing."""
+    import jax
+
+    from fusion import Corruption, finish, fit, preset, random_failing, validation_split
+
+    held_out = validation_split(data)
+    settings = preset(held_out, "argate_plus", config.preset)
+    protocol = random_failing(data.channels, data.n_channels // 2)
+    noise, key = Corruption(protocol, protocol), jax.random.key(config.seed)
+    state = fit(*settings, held_out, noise, key=key).state
+    return finish(settings.model, state, held_out, noise, key=key)
+
+
+def failing_sensor(config: Config, n_sensors: int) -> int:
+    """The sensor that is to fail.
+
+    Raises:
+        ValueError: there is no such sensor.
+    """
+    sensor = n_sensors - 1 if config.fail is None else config.fail
+    if not 0 <= sensor < n_sensors:
+        raise ValueError(f"fail={sensor}: expected 0..{n_sensors - 1}; name a sensor")
+    return sensor
+
+
+def check_length(stream: np.ndarray, n_times: int) -> None:
+    """Refuse a recording that is shorter than one window."""
+    if len(stream) < n_times:
+        raise ValueError(
+            f"recording of {len(stream)} samples: expected at least {n_times}, one window; give a "
+            "longer one"
+        )
 
 
 def break_sensor(stream: np.ndarray, fitted: FittedARGate, sensor: int, seed: int) -> np.ndarray:
@@ -110,8 +138,7 @@ def view(fitted: FittedARGate, answer: Prediction, sample: int) -> str:
 def main(config: Config) -> dict[str, Any]:
     """Train or read a network, run the recording past it, show and time it."""
     enable_compilation_cache()
-    import numpy as np
-
+    from fusion.data.own_file import read_recording
     from fusion.fitted import FittedARGate
     from fusion.streaming import SensorStream
 
@@ -120,28 +147,24 @@ def main(config: Config) -> dict[str, Any]:
             f"model={str(config.model)!r} without recording: expected --recording with it; give "
             "the samples that the network is to see"
         )
+    # What can be refused is refused before a network is trained.
     if config.model is None:
-        fitted, stream = train(config)
+        data, own = load_stream(config)
+        stream = (
+            own if config.recording is None else read_recording(config.recording, data.channels)
+        )
+        sensor = failing_sensor(config, data.n_channels) if config.recording is None else None
+        check_length(stream, data.n_time)
+        fitted = train(config, data)
         if config.save is not None:
             fitted.save(config.save)
+        if sensor is not None:
+            stream = break_sensor(stream, fitted, sensor, config.seed)
     else:
-        fitted, stream = FittedARGate.load(config.model), np.zeros((0, 0))
-    if config.recording is not None:
-        from fusion.data.own_file import read_recording
-
+        assert config.recording is not None
+        fitted = FittedARGate.load(config.model)
         stream = read_recording(config.recording, fitted.channels)
-    else:
-        sensor = len(fitted.channels) - 1 if config.fail is None else config.fail
-        if not 0 <= sensor < len(fitted.channels):
-            raise ValueError(
-                f"fail={sensor}: expected 0..{len(fitted.channels) - 1}; name a sensor"
-            )
-        stream = break_sensor(stream, fitted, sensor, config.seed)
-    if len(stream) < fitted.config.n_times:
-        raise ValueError(
-            f"recording of {len(stream)} samples: expected at least {fitted.config.n_times}, one "
-            "window; give a longer one"
-        )
+        check_length(stream, fitted.config.n_times)
     shown = follow(config, fitted, SensorStream(fitted), stream)
     print_result(
         samples=len(stream),

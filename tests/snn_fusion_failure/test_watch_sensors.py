@@ -67,6 +67,21 @@ def test_bad_streams_are_refused_with_their_line(shown: tuple[Path, dict], tmp_p
         watch_sensors.main(dataclasses.replace(config, recording=None))
 
 
+@pytest.mark.parametrize(
+    ("given", "text"),
+    [({"fail": 9}, "fail=9: expected 0..5"), ({"samples": 8}, "recording of 8 samples")],
+)
+def test_nothing_is_trained_for_what_cannot_be_shown(
+    given: dict[str, int], text: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def train(*_: object) -> None:
+        raise AssertionError("a network was trained first")
+
+    monkeypatch.setattr(watch_sensors, "train", train)
+    with pytest.raises(ValueError, match=text):
+        watch_sensors.main(watch_sensors.Config(preset="quick", **given))
+
+
 def test_own_windows_are_trained_on_from_the_shell(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     y = rng.integers(0, 2, 200)

@@ -17,6 +17,12 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
+from snn_fusion_failure.commands.sensor_streams import (
+    break_sensor,
+    check_length,
+    failing_sensor,
+    load_stream,
+)
 from snn_fusion_failure.runs import enable_compilation_cache, print_result
 from snn_fusion_failure.runs.command import run_command
 from snn_fusion_failure.runs.console import live_text
@@ -56,25 +62,6 @@ class Config:
     seed: int = 0
 
 
-def load_stream(config: Config) -> tuple[Any, np.ndarray]:
-    """The data set and a recording of its test windows, `[sample, sensor]` in raw units."""
-    import numpy as np
-
-    from fusion import load
-
-    data = load(config.dataset, config.data_dir)
-    if data.n_time == 1:
-        raise ValueError(
-            f"dataset={config.dataset!r}: expected simulated or har, whose windows make a stream"
-        )
-    # Windows of one person overlap by half in HAR; simulated ones stand alone.
-    step = data.n_time // 2 if config.dataset == "har" else data.n_time
-    windows = data.test_x[data.test_group == data.test_group[0]][:, :, data.n_time - step :]
-    stream = np.concatenate(list(windows), axis=1).T[: config.samples]
-    low, high = data.scale.low, data.scale.high
-    return data, (stream + 1.0) / 2.0 * (high - low) + low
-
-
 def train(config: Config, data: Any) -> FittedARGate:
     """A network with its monitor and temperature, trained with half of the sensors failing."""
     import jax
@@ -87,38 +74,6 @@ def train(config: Config, data: Any) -> FittedARGate:
     noise, key = Corruption(protocol, protocol), jax.random.key(config.seed)
     state = fit(*settings, held_out, noise, key=key).state
     return finish(settings.model, state, held_out, noise, key=key)
-
-
-def failing_sensor(config: Config, n_sensors: int) -> int:
-    """The sensor that is to fail.
-
-    Raises:
-        ValueError: there is no such sensor.
-    """
-    sensor = n_sensors - 1 if config.fail is None else config.fail
-    if not 0 <= sensor < n_sensors:
-        raise ValueError(f"fail={sensor}: expected 0..{n_sensors - 1}; name a sensor")
-    return sensor
-
-
-def check_length(stream: np.ndarray, n_times: int) -> None:
-    """Refuse a recording that is shorter than one window."""
-    if len(stream) < n_times:
-        raise ValueError(
-            f"recording of {len(stream)} samples: expected at least {n_times}, one window; give a "
-            "longer one"
-        )
-
-
-def break_sensor(stream: np.ndarray, fitted: FittedARGate, sensor: int, seed: int) -> np.ndarray:
-    """The recording with one sensor's second half replaced by uniform noise of its range."""
-    import numpy as np
-
-    broken = stream.copy()
-    half = len(stream) // 2
-    low, high = fitted.scale.low[sensor], fitted.scale.high[sensor]
-    broken[half:, sensor] = np.random.default_rng(seed).uniform(low, high, len(stream) - half)
-    return broken
 
 
 def view(fitted: FittedARGate, answer: Prediction, sample: int) -> str:
@@ -149,17 +104,17 @@ def main(config: Config) -> dict[str, Any]:
         )
     # What can be refused is refused before a network is trained.
     if config.model is None:
-        data, own = load_stream(config)
+        data, own = load_stream(config.dataset, config.data_dir, config.samples)
         stream = (
             own if config.recording is None else read_recording(config.recording, data.channels)
         )
-        sensor = failing_sensor(config, data.n_channels) if config.recording is None else None
+        sensor = failing_sensor(config.fail, data.n_channels) if config.recording is None else None
         check_length(stream, data.n_time)
         fitted = train(config, data)
         if config.save is not None:
             fitted.save(config.save)
         if sensor is not None:
-            stream = break_sensor(stream, fitted, sensor, config.seed)
+            stream = break_sensor(stream, fitted.scale, sensor, config.seed)
     else:
         assert config.recording is not None
         fitted = FittedARGate.load(config.model)

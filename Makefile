@@ -11,9 +11,10 @@ INSTALL := -m pip install -q --disable-pip-version-check $(if $(CONSTRAINTS),-c 
 # commit says, so that a commit is judged by the same tests whenever that happens. All: PART=0/1.
 PART   ?= $(shell expr $$(git log -1 --format=%ct 2>/dev/null || date +%s) / 86400 % 3)/3
 
-# Compiled programs are kept between runs: compiling is most of the time of a short one.
+# Compiled programs are kept between runs, the small ones too: compiling is most of the time of a
+# short run, and half of it is programs of one operation.
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
-export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0.5
+export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 
 .PHONY: help demo report test slow mutate commands lint types docs wheel lowest newer check clean
 .DEFAULT_GOAL := help

@@ -110,7 +110,7 @@ def run_area(folder: Path, numbers: Sequence[int]) -> Iterator[Done]:
         "MPLBACKEND": "agg",
     }
     environment.setdefault("JAX_COMPILATION_CACHE_DIR", str(repository.ROOT / ".cache" / "jax"))
-    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0.5")
+    environment.setdefault("JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS", "0")
     code = (
         "import sys; from pathlib import Path; "
         "from snn_fusion_failure.documentation.executing import work; "

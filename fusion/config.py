@@ -9,6 +9,7 @@ from typing import Any, Literal, NamedTuple, get_args
 from jaxtyping import Array
 
 from fusion._checks import check_choice, check_count, check_counts, check_number, check_type
+from fusion.bayesian_gate import GateKind
 from fusion.encoders import EncoderConfig
 from fusion.gating import Fusion, Normalizer, Scaling
 from fusion.losses import LossConfig, LossParams
@@ -69,6 +70,9 @@ class ModelConfig:
         encoder: the unisensory encoders.
         gate_width: hidden units of the FC-con block.
         own_scores: features also add to their own sensor's score, see `fusion.gating.Gate`.
+        gate_kind: `"deterministic"`, or distributions over the parameters of the gate's last layer
+            (`"variational"`) or of all of it (`"variational_whole"`), see `fusion.bayesian_gate`.
+        gate_prior: standard deviation of their prior, > 0 (variational).
         head_widths: hidden layers after fusion; `match_parameters` moves the first.
         aux_width: hidden units of each auxiliary head; 0 for a linear head.
         embrace_width: width that EmbraceNet docks each sensor's features to before it draws.
@@ -95,6 +99,8 @@ class ModelConfig:
     encoder: EncoderConfig = dataclasses.field(default_factory=EncoderConfig)
     gate_width: int = 32
     own_scores: bool = False
+    gate_kind: GateKind | str = "deterministic"
+    gate_prior: float = 1.0
     head_widths: tuple[int, ...] = (128,)
     aux_width: int = 0
     embrace_width: int = 128
@@ -117,6 +123,13 @@ class ModelConfig:
         check_choice("weight_sharing", self.weight_sharing, (True, False))
         check_choice("own_scores", self.own_scores, (True, False))
         check_choice("head", self.head, get_args(Head))
+        check_choice("gate_kind", self.gate_kind, get_args(GateKind))
+        check_number("gate_prior", self.gate_prior, 0.0, above=True, fix="1 is usual")
+        if self.variational and MODELS[self.model].gate != "learned":
+            raise ValueError(
+                f"gate_kind={self.gate_kind!r}: expected a model with a learned gate, "
+                f"{self.model!r} has none; use gate_kind='deterministic' or another model"
+            )
         check_count("memory_rows", self.memory_rows)
         check_number("sharpening", self.sharpening, 0.0, above=True, fix="1 changes nothing")
         if self.head == "neighbourhood" and (self.n_times, self.encoder.scalar) != (1, "table"):
@@ -147,6 +160,11 @@ class ModelConfig:
                     f"loss.{name}=True: expected a model with a learned gate, {self.model!r} has "
                     f"none; use loss.{name}=False"
                 )
+
+    @property
+    def variational(self) -> bool:
+        """Does the gate have distributions for parameters."""
+        return self.gate_kind != "deterministic"
 
     @property
     def recipe(self) -> Recipe:

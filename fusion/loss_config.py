@@ -18,6 +18,7 @@ class _LossParams(NamedTuple):
     tau: float | Array = 1.0
     anchor: float | Array = 0.0
     mask: float | Array = 1.0
+    divergence: float | Array = 1.0
 
 
 class LossParams(_LossParams):
@@ -29,13 +30,15 @@ class LossParams(_LossParams):
         tau: temperature of the target `softmax(-loss / tau)`, > 0; unused by the printed target.
         anchor: weight that pulls learned targets to `softmax(-loss / tau)`, >= 0; 0 as printed.
         mask: weight of the mask of simulated failures, >= 0; read with `mask_supervision` only.
+        divergence: weight of the gate's divergence from its prior over the number of training rows,
+            >= 0; 1 is Bayes' rule, less is a cold posterior; read with a variational gate only.
 
     Raises:
         ValueError: a number out of its range. Arrays and traced values are not looked at.
 
     Example:
         >>> LossParams(alpha=0.5)
-        LossParams(alpha=0.5, beta=1.0, tau=1.0, anchor=0.0, mask=1.0)
+        LossParams(alpha=0.5, beta=1.0, tau=1.0, anchor=0.0, mask=1.0, divergence=1.0)
     """
 
     __slots__ = ()
@@ -47,6 +50,7 @@ class LossParams(_LossParams):
         tau: Any = 1.0,
         anchor: Any = 0.0,
         mask: Any = 1.0,
+        divergence: Any = 1.0,
     ) -> LossParams:
         """Check the numbers that are given as numbers."""
         for name, value in (
@@ -54,10 +58,11 @@ class LossParams(_LossParams):
             ("beta", beta),
             ("anchor", anchor),
             ("mask", mask),
+            ("divergence", divergence),
         ):
             check_number(name, value, 0.0, fix="0 leaves the term out")
         check_number("tau", tau, 0.0, above=True, fix="small temperatures give sharp targets")
-        return super().__new__(cls, alpha, beta, tau, anchor, mask)
+        return super().__new__(cls, alpha, beta, tau, anchor, mask, divergence)
 
     @classmethod
     def _make(cls, iterable: Iterable[Any]) -> LossParams:  # type: ignore[override]

@@ -14,9 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from fusion._checks import (
-    check_key,
-)
+from fusion._checks import check_key
+from fusion.bayesian_gate import VariationalGate
 from fusion.config import ModelConfig
 from fusion.encoders import encoder, stacked_dense
 from fusion.gating import (
@@ -61,6 +60,7 @@ class FusionNet(nn.Module):
         available: Bool[Array, "b k"] | None = None,
         memory: Memory | None = None,
         excluded: Bool[Array, "b m"] | None = None,
+        given: Float[Array, "b k"] | None = None,
     ) -> MainOutput:
         """Run the network.
 
@@ -71,6 +71,7 @@ class FusionNet(nn.Module):
             available: which sensors are there, see `predict`; all of them when None.
             memory: training rows that a neighbourhood head compares with.
             excluded: rows of the memory that an example may not see.
+            given: fusion weights in place of the gate's own.
         """
         config, recipe = self.config, self.config.recipe
         b, k, t = x.shape
@@ -79,7 +80,12 @@ class FusionNet(nn.Module):
         if available is not None:
             features = jnp.where(available.T[:, :, None], features, jnp.zeros_like(features))
         weights = jnp.full((b, k), 1.0 / k, x.dtype)
-        if recipe.gate == "learned":
+        if given is not None:
+            weights = given
+        elif recipe.gate == "learned" and config.variational:
+            gate_key = None if key is None else jax.random.fold_in(key, 50)
+            weights = variational_gate(config, "gate")(features, gate_key)
+        elif recipe.gate == "learned":
             weights = Gate(config.gate_width, config.normalizer, config.own_scores, name="gate")(
                 features
             )
@@ -122,6 +128,13 @@ class FusionNet(nn.Module):
                 )
                 h = h + jnp.log(shares + EPSILON)
         return MainOutput(h, weights, features)
+
+
+def variational_gate(config: ModelConfig, name: str | None = None) -> VariationalGate:
+    """The gate of a variational network, by itself or as a part with a name."""
+    whole = config.gate_kind == "variational_whole"
+    sizes = config.gate_width, config.normalizer, config.own_scores, config.gate_prior, whole
+    return VariationalGate(*sizes, name=name)
 
 
 class AuxiliaryPaths(nn.Module):
@@ -177,6 +190,7 @@ def predict(
     *,
     available: Bool[Array, "b k"] | None = None,
     excluded: Bool[Array, "b m"] | None = None,
+    weights: Float[Array, "b k"] | None = None,
     key: Key[Array, ""] | None = None,
 ) -> MainOutput:
     """Run the main model; no auxiliary parameter is read.
@@ -194,7 +208,9 @@ def predict(
         available: False for sensors that sent nothing; all are there when None.
         excluded: rows of the memory that an example may not see, such as itself in training
             (neighbourhood head only).
-        key: PRNG key of dropout and random fusion, in training only.
+        weights: fusion weights in place of the gate's own; those of absent sensors are taken out.
+        key: PRNG key of dropout, random fusion and draws of a variational gate, in training only;
+            without it a variational gate has its mean parameters.
 
     Returns:
         Logits, fusion weights and features.
@@ -212,7 +228,7 @@ def predict(
     if key is not None:
         check_key(key)
     check_windows(config, x)
-    for name, mask in (("failed", failed), ("available", available)):
+    for name, mask in (("failed", failed), ("available", available), ("weights", weights)):
         if mask is not None and mask.shape != x.shape[:2]:
             raise ValueError(
                 f"{name}.shape={tuple(mask.shape)}: expected {tuple(x.shape[:2])}; give one value "
@@ -230,8 +246,8 @@ def predict(
             "compares with; take export(state.params) of a trained network"
         )
     net = FusionNet(config)
-    given = x, key, failed, available, memory, excluded
-    return cast(MainOutput, net.apply({"params": main}, *given))
+    inputs = x, key, failed, available, memory, excluded, weights
+    return cast(MainOutput, net.apply({"params": main}, *inputs))
 
 
 def check_windows(config: ModelConfig, x: Any) -> None:

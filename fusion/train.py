@@ -15,6 +15,7 @@ import optax
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from fusion._checks import check_key
+from fusion.bayesian_gate import gate_divergence
 from fusion.bilevel import held_out_gradient
 from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.failure_kinds import Kinds, check_kinds
@@ -91,11 +92,14 @@ def batch_loss(
     failed: Bool[Array, "b k"],
     *,
     excluded: Bool[Array, "b m"] | None = None,
+    n_examples: int | None = None,
     key: Key[Array, ""] | None = None,
 ) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
     """The training loss of one batch, with its terms and the main model's output.
 
-    Differentiable in `params` and in `hyper.loss`; see `fusion.losses.argate_loss`.
+    Differentiable in `params` and in `hyper.loss`; see `fusion.losses.argate_loss`. A variational
+    gate adds its divergence from the prior over `n_examples`, the training rows; over the rows of
+    the batch when None.
     """
     out = predict(model, export(params), x, failed, excluded=excluded, key=key)
     aux_losses = targets = None
@@ -111,6 +115,9 @@ def batch_loss(
     if config.mask_supervision:
         told = jnp.mean(mask_penalty(out.weights, failed))
         loss = loss._replace(total=loss.total + hyper.loss.mask * told)
+    if model.variational:
+        apart = gate_divergence(params["main"]["gate"], model.gate_prior) / (n_examples or len(y))
+        loss = loss._replace(total=loss.total + hyper.loss.divergence * apart)
     return loss.total, (loss, out)
 
 
@@ -125,6 +132,7 @@ def train_step(
     failed: Bool[Array, "b k"],
     *,
     rows: Int[Array, " b"] | None = None,
+    n_examples: int | None = None,
     key: Key[Array, ""],
 ) -> tuple[TrainState, EpochMetrics]:
     r"""One step of Adam with decoupled weight decay, then the projection of the lattice.
@@ -139,6 +147,7 @@ def train_step(
         x, y, failed: the batch.
         rows: their numbers among the training rows, so that a neighbourhood head leaves each
             example out of its own neighbours.
+        n_examples: all training rows, see `batch_loss`.
         key: of dropout, jitter and the rows that are compared with.
 
     Returns:
@@ -159,14 +168,15 @@ def train_step(
         excluded = mine[:, None] == number[None, :]
 
     def loss(params: Params) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
-        given = params | seen
-        return batch_loss(model, hyper, given, x, y, failed, excluded=excluded, key=key)
+        of: dict[str, Any] = {"excluded": excluded, "n_examples": n_examples, "key": key}
+        return batch_loss(model, hyper, params | seen, x, y, failed, **of)
 
     (_, (terms, out)), grads = jax.value_and_grad(loss, has_aux=True)(trained)
     if model.recipe.loss.target_training == "held_out":
 
         def terms_of(params: Params, batch: tuple[Array, ...]) -> LossTerms:
-            return batch_loss(model, hyper, params | seen, *batch[:3], excluded=batch[3])[1][0]
+            of: dict[str, Any] = {"excluded": batch[3], "n_examples": n_examples}
+            return batch_loss(model, hyper, params | seen, *batch[:3], **of)[1][0]
 
         seen_by = jnp.zeros((len(y), 1), bool) if excluded is None else excluded
         grads["targets"] = held_out_gradient(
@@ -242,7 +252,8 @@ def make_epoch(
                 phase = jnp.minimum(1.0, state.step.astype(jnp.float32) / total_steps)
                 rate = rate * 0.5 * (1.0 + jnp.cos(jnp.pi * phase))
             batch = x[index], y[index], failed[index]
-            return train_step(model, config, hyper, state, rate, *batch, rows=index, key=key)
+            of: dict[str, Any] = {"rows": index, "n_examples": n_examples, "key": key}
+            return train_step(model, config, hyper, state, rate, *batch, **of)
 
         state, metrics = jax.lax.scan(step, state, (order, jax.random.split(step_key, n_batches)))
         return state, jax.tree.map(jnp.mean, metrics)

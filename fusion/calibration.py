@@ -1,0 +1,148 @@
+"""Scores of predicted probabilities: likelihood, Brier, calibration, and what abstaining buys.
+
+Everything runs on the host in float64, on `[example, class]` probabilities and class numbers.
+"""
+
+from __future__ import annotations
+
+from typing import NamedTuple
+
+import numpy as np
+from jax.typing import ArrayLike
+from jaxtyping import Float
+
+from fusion._checks import check_count
+
+BINS = 15
+"""Bins of equal width that the calibration error of record is counted in."""
+
+
+class RiskCoverage(NamedTuple):
+    """Error among the examples that are answered, for every number of them.
+
+    Attributes:
+        coverage: share of examples that are answered, `1/n` to 1.
+        risk: error rate among them, the surest first.
+    """
+
+    coverage: Float[np.ndarray, " n"]
+    risk: Float[np.ndarray, " n"]
+
+
+def _checked(probabilities: ArrayLike, labels: ArrayLike) -> tuple[np.ndarray, np.ndarray]:
+    p, y = np.asarray(probabilities, np.float64), np.asarray(labels, np.int64)
+    if p.ndim != 2 or y.shape != p.shape[:1] or not y.size:
+        raise ValueError(
+            f"labels=array of shape {y.shape}: expected one class for each of the rows of "
+            f"probabilities, shape {p.shape}; give both of the same examples"
+        )
+    if y.min() < 0 or y.max() >= p.shape[1]:
+        raise ValueError(
+            f"labels=array spanning {y.min()}..{y.max()}: expected 0..{p.shape[1] - 1}; give the "
+            "class numbers that the probabilities were made for"
+        )
+    # float32 softmax sums to one within about 1e-6.
+    if not np.isfinite(p).all() or p.min() < 0.0 or np.abs(p.sum(axis=1) - 1.0).max() > 1e-4:
+        raise ValueError(
+            "probabilities=array with rows that are no shares: expected values in [0, 1] that sum "
+            "to 1 in each row; apply the softmax to logits"
+        )
+    return p, y
+
+
+def negative_log_likelihood(probabilities: ArrayLike, labels: ArrayLike) -> float:
+    r"""Mean of :math:`-\log p_{n, y_n}`, in nats; probabilities below 1e-12 count as that.
+
+    Raises:
+        ValueError: probabilities that are no shares, labels that do not fit.
+
+    Example:
+        >>> p, y = np.array([[0.5, 0.5], [0.75, 0.25]]), np.array([0, 0])
+        >>> round(negative_log_likelihood(p, y), 4)
+        0.4904
+    """
+    p, y = _checked(probabilities, labels)
+    return float(-np.log(np.maximum(p[np.arange(y.size), y], 1e-12)).mean())
+
+
+def brier_score(probabilities: ArrayLike, labels: ArrayLike) -> float:
+    r"""Mean squared distance of the probabilities from the truth, in [0, 2].
+
+    .. math:: \frac1N \sum_n \sum_c \left(p_{nc} - [c = y_n]\right)^2
+
+    Raises:
+        ValueError: probabilities that are no shares, labels that do not fit.
+
+    Source: Brier (1950).
+    """
+    p, y = _checked(probabilities, labels)
+    truth = np.eye(p.shape[1])[y]
+    return float(((p - truth) ** 2).sum(axis=1).mean())
+
+
+def expected_calibration_error(
+    probabilities: ArrayLike, labels: ArrayLike, *, bins: int = BINS
+) -> float:
+    r"""How far confidence is from accuracy, over bins of equal width.
+
+    .. math:: \sum_b \frac{n_b}{N} \left|\text{acc}_b - \text{conf}_b\right|
+
+    with the confidence :math:`\max_c p_{nc}` of each example; a confidence on a border counts to
+    the bin below it.
+
+    Raises:
+        ValueError: probabilities that are no shares, labels that do not fit, no bins.
+
+    Source: Guo et al. (2017), section 2.
+    """
+    check_count("bins", bins)
+    p, y = _checked(probabilities, labels)
+    confidence, right = p.max(axis=1), p.argmax(axis=1) == y
+    index = np.clip(np.ceil(confidence * bins).astype(int) - 1, 0, bins - 1)
+    gap = np.bincount(index, confidence - right, minlength=bins)
+    return float(np.abs(gap).sum() / y.size)
+
+
+def risk_coverage(confidence: ArrayLike, right: ArrayLike) -> RiskCoverage:
+    """Error rate among the surest examples, for every number of examples that are answered.
+
+    Examples of equal confidence share their errors evenly, so that the order of rows says nothing.
+
+    Args:
+        confidence: the larger, the earlier an example is answered.
+        right: True where the prediction is right.
+
+    Raises:
+        ValueError: different lengths, no examples, confidence that has no rank.
+
+    Source: El-Yaniv and Wiener (2010).
+    """
+    c, ok = np.asarray(confidence, np.float64), np.asarray(right, bool)
+    if c.shape != ok.shape or c.ndim != 1 or not c.size or not np.isfinite(c).all():
+        raise ValueError(
+            f"confidence=array of shape {c.shape}: expected one finite number for each of "
+            f"{ok.size} predictions; give both of the same examples"
+        )
+    _, level, count = np.unique(-c, return_inverse=True, return_counts=True)
+    wrong = np.bincount(level, ~ok) / count
+    errors = np.cumsum(wrong[np.sort(level)])
+    answered = np.arange(1, c.size + 1)
+    return RiskCoverage(answered / c.size, errors / answered)
+
+
+def aurc(confidence: ArrayLike, right: ArrayLike) -> float:
+    """Area under the risk-coverage curve: the mean of its risks; smaller is better.
+
+    A confidence that says nothing has the error rate; the best possible one answers all right
+    examples first.
+
+    Raises:
+        ValueError: as `risk_coverage`.
+
+    Source: Geifman et al. (2019).
+
+    Example:
+        >>> round(aurc(np.array([0.9, 0.8, 0.7]), np.array([True, True, False])), 4)
+        0.1111
+    """
+    return float(risk_coverage(confidence, right).risk.mean())

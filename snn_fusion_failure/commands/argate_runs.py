@@ -35,6 +35,8 @@ class Config:
     equal_weights, modality_dropout, embracenet, oracle."""
     head: str | None = None
     """dense; for driver also neighbourhood (its default) and embedding."""
+    gate: Literal["deterministic", "bayesian", "bayesian_whole"] = "deterministic"
+    """bayesian: fusion weights with distributions, by the gate's last layer or by all of it."""
     preset: str = "paper"
     """paper (the settings of record) or quick (few epochs)."""
     protocol: ProtocolName | None = None
@@ -83,11 +85,7 @@ class Config:
 
 
 class Case(NamedTuple):
-    """One training and its test.
-
-    Attributes:
-        title: which sensors fail, in words; noise: the same as a corruption.
-    """
+    """One training and its test; `title` says in words which sensors fail, `noise` exactly."""
 
     title: str
     noise: Corruption
@@ -106,6 +104,7 @@ def build_settings(config: Config, dataset: Dataset) -> Preset:
         "hyper.loss.tau": config.tau,
         "model.normalizer": config.normalizer,
         "model.loss.fixed_targets": config.normalizer,
+        "model.gate_kind": config.gate.replace("bayesian", "variational"),
         "model.loss.mask_supervision": "true" if config.mask_supervision else None,
     }
     given = [f"{name}={value}" for name, value in named.items() if value is not None]

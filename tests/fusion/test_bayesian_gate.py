@@ -201,3 +201,17 @@ def test_what_cannot_be_a_gate_is_refused(changes: dict[str, Any], message: str)
 def test_a_negative_weight_of_the_divergence_is_refused() -> None:
     with pytest.raises(ValueError, match="divergence=-1"):
         LossParams(divergence=-1)
+
+
+@pytest.mark.parametrize(
+    ("gate", "kind"), [("bayesian", "variational"), ("bayesian_whole", "variational_whole")]
+)
+def test_the_command_builds_the_gate_that_was_asked_for(gate: Any, kind: str) -> None:
+    from fusion.data import load
+    from snn_fusion_failure.commands.argate_runs import Config, build_settings
+
+    options = Config(dataset="simulated", gate=gate, changes=("model.gate_prior=0.3",))
+    model = build_settings(options, load("simulated")).model
+    assert (model.gate_kind, model.gate_prior) == (kind, 0.3)
+    with pytest.raises(ValueError, match="'baseline' has none"):
+        build_settings(dataclasses.replace(options, model="baseline"), load("simulated"))

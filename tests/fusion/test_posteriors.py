@@ -125,4 +125,4 @@ def test_laplace_needs_a_learned_deterministic_gate(changes: dict[str, Any]) -> 
     with pytest.raises(ValueError, match="expected a learned, deterministic gate"):
         fit_laplace(dataclasses.replace(CONFIG, **changes), MAIN, X)
     with pytest.raises(ValueError, match="prior=0"):
-        fit_laplace(CONFIG, MAIN, X, prior=0)
+        fit_laplace(CONFIG, MAIN, X, prior=0.0)

@@ -119,11 +119,11 @@ def test_one_pass_is_near_many_draws(kind: str, normalizer: Any) -> None:
     found = in_one_pass(config, main, X)
     np.testing.assert_allclose(found.weights, drawn.weights, atol=0.02)
     np.testing.assert_allclose(found.probabilities, drawn.probabilities, atol=0.05)
-    plain = jax.nn.softmax(predict(config, main, X).logits, axis=-1)
-    error, without = (jnp.abs(p - drawn.probabilities).mean() for p in (found[0], plain))
+    plain = predict(config, main, X).weights
+    error, without = (jnp.abs(w - drawn.weights).mean() for w in (found.weights, plain))
     assert float(error) < float(without)
-    np.testing.assert_allclose(found.weight_low, drawn.weight_low, atol=0.03)
-    np.testing.assert_allclose(found.weight_high, drawn.weight_high, atol=0.03)
+    np.testing.assert_allclose(found.weight_low, drawn.weight_low, atol=0.05)
+    np.testing.assert_allclose(found.weight_high, drawn.weight_high, atol=0.05)
     # Second order in the spread of the logits: right in size, not to the digit.
     assert float(drawn.epistemic.max()) > 5e-4
     ratio = np.asarray(found.epistemic) / np.asarray(drawn.epistemic)

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from fusion.calibration import (
+from fusion.predictive_scores import (
     aurc,
     brier_score,
     expected_calibration_error,

@@ -11,7 +11,7 @@ are those of `jaxsnn.navigation.navigation_env`; the step is compiled at the fir
 
 from __future__ import annotations
 
-from typing import Any, ClassVar
+from typing import Any
 
 import gymnasium
 import jax
@@ -45,7 +45,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         way: from `way.way_length`: the reward counts progress along the shortest way.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"render_modes": []}
+    metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as the base class has it
 
     def __init__(
         self, params: WorldParams, *, max_steps: int = 200, way: WayLength | None = None
@@ -82,7 +82,7 @@ class RobotVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         max_steps, way: as for `RobotEnv`.
     """
 
-    metadata: ClassVar[dict[str, Any]] = {"autoreset_mode": AutoresetMode.NEXT_STEP}
+    metadata: dict[str, Any] = {"autoreset_mode": AutoresetMode.NEXT_STEP}  # noqa: RUF012
 
     def __init__(
         self,

@@ -7,7 +7,9 @@ stays the only store, and what a tracker misses is never lost.
 from __future__ import annotations
 
 import contextlib
+import re
 import time
+import warnings
 from collections.abc import Callable, Iterator, Mapping
 from typing import Any, Protocol
 
@@ -75,7 +77,9 @@ class WandB:
     def __init__(self, sweep: Sweep) -> None:
         import wandb
 
-        self._run = wandb.init(project=f"sweep-{sweep.study_name}", name=sweep.out.name)
+        # W&B refuses these characters, and a study of one's own is called `module:function`.
+        project = re.sub(r"[/\\#?%:]+", "-", f"sweep-{sweep.study_name}")
+        self._run = wandb.init(project=project, name=sweep.out.name)
 
     def log(self, setting: int, axes: Mapping[str, Any], metrics: Mapping[str, float]) -> None:
         """A step."""
@@ -119,7 +123,14 @@ class _Watcher:
             self._sent.add(setting)
             axes = {k: v[setting].item() for k, v in columns.items()}
             metrics = {m: mean_of(dataset, m, setting) for m in self._sweep.metrics}
-            self._tracker.log(setting, axes, metrics)
+            try:
+                self._tracker.log(setting, axes, metrics)
+            except Exception as error:  # A library's own, for a server that is gone or full.
+                self._tracker = None
+                warnings.warn(
+                    f"the tracker ended and is left out from here on: {error}", stacklevel=2
+                )
+                return
         self._last = time.monotonic()
 
 
@@ -128,7 +139,7 @@ def make_tracker(name: str, sweep: Sweep, *, every: float = 5.0) -> Iterator[Any
     """Something with `look()`, to be called after chunks; it does nothing without a name.
 
     Raises:
-        ValueError: the tracker's library is not installed.
+        ValueError: the tracker's library is not installed, or does not start.
     """
     tracker: Tracker | None = None
     if name:
@@ -138,6 +149,10 @@ def make_tracker(name: str, sweep: Sweep, *, every: float = 5.0) -> Iterator[Any
         except ImportError as error:
             raise ValueError(
                 f"tracker={name!r}: expected the library {library}; pip install {library}"
+            ) from error
+        except Exception as error:  # A library's own: no server, no account, no such store.
+            raise ValueError(
+                f"tracker={name!r}: expected {library} to start; set it up or do without; {error}"
             ) from error
     watcher = _Watcher(sweep, tracker, every)
     try:

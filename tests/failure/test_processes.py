@@ -20,7 +20,9 @@ SIMULATOR = "echo $$ >> {pids}; sleep 300 & echo $! >> {pids}; wait"
 """A simulator that starts another program and hangs."""
 
 PARENT = """
-import importlib.util, sys
+import importlib.util, signal, sys
+# A shell starts what it puts in the background, and its children, with this signal ignored.
+signal.signal(signal.SIGINT, signal.default_int_handler)
 spec = importlib.util.spec_from_file_location("processes", sys.argv[1])
 module = importlib.util.module_from_spec(spec)
 sys.modules["processes"] = module

@@ -5,8 +5,11 @@ from __future__ import annotations
 import dataclasses
 import json
 import struct
+import sys
+import warnings
 from html.parser import HTMLParser
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -15,6 +18,7 @@ from scipy import stats
 
 from snn_fusion_failure.commands import sweep
 from snn_fusion_failure.commands.show_sweep import Show, show
+from snn_fusion_failure.sweeps import trackers
 from snn_fusion_failure.sweeps.importance import importance
 from snn_fusion_failure.sweeps.page import page_data, write_page
 from snn_fusion_failure.sweeps.rank import compare, pareto, rank
@@ -181,5 +185,71 @@ def test_a_tracker_gets_every_setting_once(out) -> None:
     wanted = load(out)["value"].mean("seed").values.ravel()
     assert [step for step, _ in values] == list(range(6))
     np.testing.assert_allclose([v for _, v in values], wanted, rtol=1e-5)
-    with pytest.raises(ValueError, match="tracker='mlflow': expected the library mlflow"):
+
+
+@pytest.mark.parametrize("library", ["mlflow", "wandb"])
+def test_a_tracker_without_its_library_names_it(
+    library: Any, out: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, library, None)
+    with pytest.raises(ValueError, match=f"tracker='{library}': expected the library {library}"):
+        sweep.main(dataclasses.replace(TOY, out=out, tracker=library))
+
+
+class Gone:
+    """A tracker whose server goes away."""
+
+    def __init__(self, _: object) -> None:
+        pass
+
+    def log(self, *_: object) -> None:
+        raise OSError("server is gone")
+
+    def close(self) -> None:
+        pass
+
+
+def test_a_tracker_that_ends_does_not_end_the_sweep(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(trackers.TRACKERS, "tensorboard", (Gone, "tensorboardX"))
+    with pytest.warns(UserWarning, match="server is gone"):
+        sweep.main(dataclasses.replace(TOY, out=tmp_path / "new"))
+    assert bool(load(tmp_path / "new")["value"].notnull().all())
+
+
+def test_a_tracker_that_does_not_start_says_why(out: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(_: object) -> None:
+        raise RuntimeError("no account")
+
+    monkeypatch.setitem(trackers.TRACKERS, "tensorboard", (refuse, "tensorboardX"))
+    with pytest.raises(ValueError, match="to start; set it up or do without; no account"):
+        sweep.main(dataclasses.replace(TOY, out=out))
+
+
+def test_mlflow_gets_every_setting(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    mlflow = pytest.importorskip("mlflow", reason="extra `mlflow` is not installed")
+    monkeypatch.setenv("MLFLOW_ALLOW_FILE_STORE", "true")
+    mlflow.set_tracking_uri(f"file:{tmp_path}")
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # MLflow's own, of its file store.
         sweep.main(dataclasses.replace(TOY, out=out, tracker="mlflow"))
+        runs = mlflow.search_runs(search_all_experiments=True, output_format="list")
+    found = sorted(r.data.metrics["value"] for r in runs if r.data.metrics)
+    wanted = np.sort(load(out)["value"].mean("seed").values.ravel())
+    np.testing.assert_allclose(found, wanted, rtol=1e-5)
+
+
+def test_wandb_takes_a_study_of_one_s_own(
+    out: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    pytest.importorskip("wandb", reason="extra `wandb` is not installed")
+    for name, value in (("WANDB_MODE", "offline"), ("WANDB_DIR", str(tmp_path))):
+        monkeypatch.setenv(name, value)
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")
+        sweep.main(dataclasses.replace(TOY, out=out, tracker="wandb"))
+    (file,) = tmp_path.rglob("*.wandb")
+    assert file.stat().st_size > 0

@@ -128,8 +128,9 @@ def run_workers(
                 )
                 running[work] = point
                 left -= 1
-            # The initial design has to be known before anything can be chosen from it.
-            known = state.n >= config.n_init or not (running or ready)
+            # Half of the initial design is enough to choose from: one slow simulation of it must
+            # not keep the other workers waiting.
+            known = 2 * state.n >= config.n_init or not (running or ready)
             if not ready and left > 0 and known:
                 choose()
                 continue

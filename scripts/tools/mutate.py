@@ -138,9 +138,10 @@ class Tests:
 
     def close(self) -> None:
         """End the server."""
-        assert self._server.stdin is not None
+        assert self._server.stdin is not None and self._server.stdout is not None
         self._server.stdin.close()
         self._server.wait()
+        self._server.stdout.close()
 
 
 def _end(child: int) -> None:

@@ -77,7 +77,7 @@ def test_refined_importance_sampling_stops_by_itself_and_covers(gradients) -> No
     found = ak_sampling(compiled(problem), problem.threshold, DIM, key=KEY, slopes=slopes)
     assert found.estimate.known
     assert found.estimate.lower <= problem.probability <= found.estimate.upper
-    assert found.estimate.n_simulations <= (100 if gradients else 200)
+    assert found.estimate.n_simulations <= 160
     assert (found.n_gradients == found.estimate.n_simulations) == gradients
 
 

@@ -61,7 +61,9 @@ def _worst(kind: str, output_range: Range, dtype: str, seed: int) -> list[float]
     rng = np.random.default_rng(seed)
 
     def draw(leaf: jax.ShapeDtypeStruct) -> jax.Array:
-        return jnp.asarray(offset + width * rng.normal(size=leaf.shape), dtype)
+        most = float(jnp.finfo(dtype).max)
+        drawn = offset + width * rng.normal(size=leaf.shape)
+        return jnp.asarray(np.clip(drawn, -most, most), dtype)
 
     project = jax.jit(lambda p: module.project(config, p))
     check = jax.jit(lambda p: module.check(config, p))

@@ -57,7 +57,7 @@ def make(
 
     def filled(y: Any, n: Any) -> Any:
         """Outputs for the surrogate: an invalid one counts as the best case seen."""
-        seen = (jnp.arange(n_total) < n) & jnp.isfinite(y)
+        seen = (jnp.arange(n_total, dtype=n.dtype) < n) & jnp.isfinite(y)
         return jnp.where(seen, y, jnp.min(jnp.where(seen, y, jnp.inf)))
 
     def trial(params: SearchParams, key: Any, carry: Any, begin: int, end: int) -> Any:
@@ -70,7 +70,7 @@ def make(
 
         def step(carry: Any) -> Any:
             n, u, y, fitted = carry
-            used = (jnp.arange(n_total) < n).astype(u.dtype)
+            used = (jnp.arange(n_total, dtype=n.dtype) < n).astype(u.dtype)
             raw = filled(y, n)
             z, _, _ = gp.standardize(raw, used)
             due = (n - n_init) % refit_every == 0

@@ -124,7 +124,7 @@ def main(config: Config) -> dict[str, Any]:
     print_result(
         samples=len(stream),
         ms_per_sample=shown["ms_per_sample"],
-        failed=",".join(shown["failed"]) or "none",
+        failed=",".join(shown["failed_sensors"]) or "none",
     )
     return shown
 
@@ -160,7 +160,8 @@ def follow(
     # The first answer compiles.
     return {
         "ms_per_sample": 1e3 * float(np.median(took[1:] or took)),
-        "failed": [c for c, f in zip(fitted.channels, answer.failed[0], strict=True) if f],
+        # Not "failed", by which a command says that its own work did.
+        "failed_sensors": [c for c, f in zip(fitted.channels, answer.failed[0], strict=True) if f],
     }
 
 

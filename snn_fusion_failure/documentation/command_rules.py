@@ -91,6 +91,14 @@ RULES = (
     Rule("train_argate.py simulated", "--epochs 1 --overwrite"),
     Rule("train_argate.py", "--epochs 1 --preset quick --overwrite"),
     Rule("watch_sensors.py", "--preset quick --samples 80"),
+    *(
+        Rule(
+            f"study_sensors.py {study}",
+            "--preset quick --seeds 1 --models argate_plus --rows 'n_clean=8 uniform' "
+            "--results runs",
+        )
+        for study in ("driver_heads", "driver_tagged")
+    ),
     Rule(
         "study_sensors.py",
         "--preset quick --seeds 1 --models argate_plus --rows zero --results runs",
@@ -197,6 +205,7 @@ PLACEHOLDERS = {
     "$FUSION_DATA_DIR": "data",
     "/shared/": "runs/shared/",
     "$INDEX": "0",
+    "my.json": "examples/room.json",
     "ROOT": "runs/kitti",
     "KITTI": "runs/kitti",
     "DIR": "runs/dir",

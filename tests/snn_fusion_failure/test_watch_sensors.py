@@ -12,6 +12,7 @@ from fusion.data.own_file import read_recording
 from fusion.fitted import FittedARGate
 from snn_fusion_failure.commands import train_argate, watch_sensors
 from snn_fusion_failure.commands.argate_runs import Config as TrainConfig
+from snn_fusion_failure.runs.command import run_command
 
 # optax's Adam raises a float to an integer power, which strict promotion forbids.
 pytestmark = pytest.mark.relaxed
@@ -48,7 +49,7 @@ def test_a_recording_from_a_file_is_watched_with_its_lost_samples(
     read = read_recording(path, names)
     assert np.isnan(read[19, -1]) and read[0, 0] == pytest.approx(rows[0, 0], abs=1e-3)
     config = watch_sensors.Config(model=folder / "net.npz", recording=path)
-    assert names[-1] in watch_sensors.main(config)["failed"]
+    assert names[-1] in watch_sensors.main(config)["failed_sensors"]
 
 
 def test_bad_streams_are_refused_with_their_line(shown: tuple[Path, dict], tmp_path: Path) -> None:
@@ -65,6 +66,11 @@ def test_bad_streams_are_refused_with_their_line(shown: tuple[Path, dict], tmp_p
         watch_sensors.main(config)
     with pytest.raises(ValueError, match="--recording"):
         watch_sensors.main(dataclasses.replace(config, recording=None))
+
+
+def test_a_dead_sensor_that_is_found_is_not_a_failed_command(shown: tuple[Path, dict]) -> None:
+    _, found = shown
+    run_command(watch_sensors.Config, lambda _: found, description="", argv=[])
 
 
 @pytest.mark.parametrize(

@@ -150,6 +150,11 @@ class ModelConfig:
                 f"encoder.levels={len(self.encoder.levels)} rows: expected one for each of "
                 f"{self.n_sensors} sensors; make levels with reading_levels"
             )
+        if self.encoder.learns_by_reward and not self.recipe.loss.auxiliary:
+            raise ValueError(
+                "encoder.spiking.learning='reward_stdp': expected a model with auxiliary paths, "
+                f"whose losses are the reward, {self.model!r} has none; use 'surrogate' or 'fixed'"
+            )
         if self.loss is None:
             return
         check_type("loss", self.loss, LossConfig, "build a LossConfig")

@@ -8,6 +8,7 @@ times faster inside `jax.lax.scan`, where XLA's CPU convolution is slow.
 from __future__ import annotations
 
 import dataclasses
+import functools
 import math
 from typing import Literal, get_args
 
@@ -17,10 +18,14 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from fusion._checks import check_choice, check_count, check_counts
+from fusion._checks import check_choice, check_count, check_counts, check_type
+from fusion.spectrum import spectral_features
+from fusion.spiking.config import SpikingConfig
+from fusion.spiking.encoder import SpikingEncoder
 from fusion.tables import TableEncoder
 
 Backend = Literal["matmul", "conv"]
+SeriesKind = Literal["conv", "spiking"]
 ScalarKind = Literal["fourier", "table"]
 
 
@@ -29,7 +34,8 @@ class EncoderConfig:
     """Sizes of the unisensory encoders (shared by all models that are compared).
 
     Attributes:
-        features: width D of the feature vector of one sensor.
+        features: width D of the feature vector of one sensor (not read by spiking encoders, whose
+            last layer is as wide as its neurons are many).
         conv_features: channels of the two convolutions (series only).
         conv_kernels: their widths, in samples.
         conv_strides: their strides, in samples.
@@ -42,6 +48,9 @@ class EncoderConfig:
         ranks: share of training rows below each level, for the first rows of the tables.
         known_readings: a table gives a token of its own for readings that are no level.
         backend: how `conv1d` is computed; `"matmul"` for CPU, `"conv"` for accelerators.
+        series: what encodes a sensor, `"conv"` the convolutions and Fourier features above,
+            `"spiking"` the neurons of `spiking`, for series and for scalars.
+        spiking: code, layers and neurons of the spiking encoders.
 
     Raises:
         ValueError: sizes that cannot be built, or readings that are not sorted.
@@ -58,6 +67,8 @@ class EncoderConfig:
     ranks: tuple[tuple[float, ...], ...] = ()
     known_readings: bool = True
     backend: Backend | str = "matmul"
+    series: SeriesKind | str = "conv"
+    spiking: SpikingConfig = dataclasses.field(default_factory=SpikingConfig)
 
     def __post_init__(self) -> None:
         """Refuse sizes that cannot be built."""
@@ -67,6 +78,8 @@ class EncoderConfig:
             check_counts(name, getattr(self, name), size=2)
         check_choice("spectral", self.spectral, (True, False))
         check_choice("backend", self.backend, get_args(Backend))
+        check_choice("series", self.series, get_args(SeriesKind))
+        check_type("spiking", self.spiking, SpikingConfig, "build a SpikingConfig")
         for k, row in enumerate(self.levels):
             if not row or not all(math.isfinite(v) for v in row) or sorted(set(row)) != list(row):
                 raise ValueError(
@@ -85,6 +98,16 @@ class EncoderConfig:
                 f"ranks={len(self.ranks)} rows: expected one rank for each level; make ranks with "
                 "reading_ranks"
             )
+
+    @property
+    def width(self) -> int:
+        """Width of the feature vector that the encoder gives."""
+        return self.spiking.features if self.series == "spiking" else self.features
+
+    @property
+    def learns_by_reward(self) -> bool:
+        """Whether the synapses learn from the auxiliary losses instead of by gradients."""
+        return self.series == "spiking" and self.spiking.learning == "reward_stdp"
 
 
 def conv1d(
@@ -156,45 +179,6 @@ def stacked_dense(
     return x @ kernel + bias[:, None, :]
 
 
-def _fourier_basis(n: int) -> tuple[np.ndarray, int]:
-    """Hann-windowed cosine and sine columns for a real series of n samples, without the mean."""
-    bins = n // 2
-    angle = 2.0 * np.pi * np.outer(np.arange(n), np.arange(1, bins + 1)) / n
-    window = np.hanning(n)[:, None] * 2.0 / n
-    basis = np.concatenate([np.cos(angle), np.sin(angle)], axis=1) * window
-    return basis.astype(np.float32), bins
-
-
-def spectral_features(x: Float[Array, "k b t"]) -> Float[Array, "k b f"]:
-    r"""Log power spectrum and moments of each window: fixed, cheap and without parameters.
-
-    .. math:: \log\left(10^{-6} + |\hat x_m|^2\right), \; m = 1 \ldots T/2
-
-    and mean, its square, log standard deviation, maximum, minimum, root mean squared step and mean
-    absolute deviation. The constants bring every feature to the order of one for inputs in [-1, 1].
-    """
-    basis, bins = _fourier_basis(x.shape[-1])
-    mean = jnp.mean(x, axis=-1, keepdims=True)
-    centred = x - mean
-    z = centred @ jnp.asarray(basis)
-    power = z[..., :bins] ** 2 + z[..., bins:] ** 2
-    sd = jnp.sqrt(jnp.mean(centred**2, axis=-1, keepdims=True) + 1e-8)
-    step = jnp.sqrt(jnp.mean(jnp.diff(x, axis=-1) ** 2, axis=-1, keepdims=True) + 1e-8)
-    return jnp.concatenate(
-        [
-            0.25 * jnp.log(power + 1e-6) + 1.5,
-            3.0 * mean,
-            3.0 * mean**2,
-            jnp.log(sd) + 2.0,
-            jnp.max(x, axis=-1, keepdims=True),
-            jnp.min(x, axis=-1, keepdims=True),
-            5.0 * step,
-            5.0 * jnp.mean(jnp.abs(centred), axis=-1, keepdims=True),
-        ],
-        axis=-1,
-    )
-
-
 class SeriesEncoder(nn.Module):
     """Encode windows of K sensors: two strided convolutions beside a log-spectrum path.
 
@@ -256,6 +240,16 @@ def _novelty(x: Float[Array, "k b 1"], levels: tuple[tuple[float, ...], ...]) ->
     return 0.25 * jnp.log(distance + 1e-6) + 2.0
 
 
+def scalar_features(config: EncoderConfig, x: Float[Array, "k b 1"]) -> Float[Array, "k b c"]:
+    """Octaves of each scalar, and how far it lies from the nearest known reading."""
+    octaves = jnp.asarray(np.pi * 2.0 ** np.arange(-1, config.frequencies - 1), x.dtype)
+    angle = x * octaves[None, None, :]
+    parts = [x, jnp.sin(angle), jnp.cos(angle)]
+    if config.levels:
+        parts.append(_novelty(x, config.levels))
+    return jnp.concatenate(parts, axis=-1)
+
+
 class ScalarEncoder(nn.Module):
     r"""Encode K scalar sensors by Fourier features and a dense layer each.
 
@@ -270,17 +264,23 @@ class ScalarEncoder(nn.Module):
     @nn.compact
     def __call__(self, x: Float[Array, "k b 1"]) -> Float[Array, "k b f"]:
         """Return one feature vector per sensor and example."""
-        octaves = jnp.asarray(np.pi * 2.0 ** np.arange(-1, self.config.frequencies - 1), x.dtype)
-        angle = x * octaves[None, None, :]
-        parts = [x, jnp.sin(angle), jnp.cos(angle)]
-        if self.config.levels:
-            parts.append(_novelty(x, self.config.levels))
-        phi = jnp.concatenate(parts, axis=-1)
+        phi = scalar_features(self.config, x)
         return nn.relu(stacked_dense(self, "out", phi, self.config.features))
 
 
 def encoder(config: EncoderConfig, n_times: int, name: str) -> nn.Module:
-    """The encoder for windows of `n_times` samples: `ScalarEncoder` for one, else the series."""
+    """The encoder for windows of `n_times` samples: `ScalarEncoder` for one, else the series.
+
+    Raises:
+        ValueError: windows that the layers cannot read.
+    """
+    if config.series == "spiking":
+        if n_times > 1 and n_times % config.spiking.stride:
+            raise ValueError(
+                f"n_times={n_times}: expected a multiple of {config.spiking.stride} samples, the "
+                "strides of all spiking layers; change spiking.strides or cut the windows"
+            )
+        return SpikingEncoder(config.spiking, functools.partial(scalar_features, config), name=name)
     shortest = config.conv_kernels[0] + config.conv_strides[0] * (config.conv_kernels[1] - 1)
     if n_times == 1 and config.scalar == "table":
         if not config.levels:

@@ -172,7 +172,7 @@ def init(key: Key[Array, ""], config: ModelConfig) -> Params:
     main_key, aux_key, target_key = jax.random.split(key, 3)
     x = jnp.zeros((1, config.n_sensors, config.n_times))
     failed = jnp.zeros((1, config.n_sensors), bool)
-    features = jnp.zeros((config.n_sensors, 1, config.encoder.features))
+    features = jnp.zeros((config.n_sensors, 1, config.encoder.width))
     params = {"main": FusionNet(config).init(main_key, x, failed=failed)["params"]}
     loss = config.recipe.loss
     if loss.auxiliary:

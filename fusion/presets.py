@@ -3,14 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, get_args
 
 from fusion._checks import check_choice
 from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
-from fusion.encoders import EncoderConfig, reading_levels, readings_recur
+from fusion.encoders import EncoderConfig, SeriesKind, reading_levels, readings_recur
 from fusion.losses import LossParams
 from fusion.sizes import match_parameters
+from fusion.spiking.config import SpikingConfig
 from fusion.tables import BINS, reading_ranks
 
 
@@ -90,18 +91,74 @@ _QUICK_EPOCHS = {"har": 5, "driver": 1, "simulated": 15, "own": 15}
 
 PRESETS = ("quick", "paper")
 
+ENCODED: dict[str, tuple[str, str]] = {
+    "spiking_baseline": ("baseline", "spiking"),
+    "spiking_netgated": ("netgated", "spiking"),
+    "spiking_argate_plus": ("argate_plus", "spiking"),
+    "spiking_argate": ("argate_l", "spiking"),
+}
+"""Names of a recipe with an encoder; any other pair is had by `encoder`."""
+
+# Neurons and the sizes that go with them; chosen on validation rows, see docs/spiking_fusion.md.
+_SPIKING: dict[str, tuple[SpikingConfig, dict[str, Any]]] = {
+    "har": (
+        SpikingConfig(widths=(24, 48), taps=(8, 4), strides=(4, 2)),
+        {"head_widths": (96,), "gate_width": 32},
+    ),
+    "driver": (SpikingConfig(widths=(24, 24), taps=(1, 1), strides=(1, 1), steps=16), {}),
+    "simulated": (SpikingConfig(widths=(12, 24), taps=(4, 4), strides=(2, 2)), {}),
+    "own": (SpikingConfig(widths=(16, 32), taps=(1, 4), strides=(1, 1)), {}),
+}
+
+
+def recipe_and_encoder(model: str, encoder: str | None = None) -> tuple[str, str]:
+    """The recipe that a name means, and the encoder that goes with it.
+
+    Raises:
+        ValueError: an unknown name, or an encoder that is not the name's.
+
+    Example:
+        >>> recipe_and_encoder("spiking_argate"), recipe_and_encoder("oracle", "spiking")
+        (('argate_l', 'spiking'), ('oracle', 'spiking'))
+    """
+    check_choice("model", model, (*MODELS, *ENCODED))
+    if encoder is not None:
+        check_choice("encoder", encoder, get_args(SeriesKind))
+    recipe, own = ENCODED.get(model, (model, encoder or "conv"))
+    if encoder not in (None, own):
+        raise ValueError(
+            f"encoder={encoder!r}: expected {own!r}, which {model!r} has; use model={recipe!r} or "
+            "leave the encoder out"
+        )
+    return recipe, own
+
+
+def _with_encoder(base: Preset, dataset: Dataset, encoder: str) -> Preset:
+    """The preset with another encoder, and with the sizes that go with it."""
+    if encoder == "conv":
+        return base
+    spiking, changes = _SPIKING[dataset.name]
+    series = dataclasses.replace(base.model.encoder, series=encoder, spiking=spiking)
+    return base._replace(model=dataclasses.replace(base.model, encoder=series, **changes))
+
 
 def preset(
-    dataset: Dataset, model: str = "argate_l", name: str = "paper", *, head: str | None = None
+    dataset: Dataset,
+    model: str = "argate_l",
+    name: str = "paper",
+    *,
+    head: str | None = None,
+    encoder: str | None = None,
 ) -> Preset:
     """Network and training of record for a data set, its size matched to that of ARGate-L.
 
     Args:
         dataset: gives the sizes.
-        model: a name in `fusion.config.MODELS`.
+        model: a name in `fusion.config.MODELS`, or one of `ENCODED`, such as `spiking_argate`.
         name: `"paper"` for the record, `"quick"` for the same with few epochs.
         head: `"dense"`; for the driver data also `"neighbourhood"` (its default), which compares
             with training rows, and `"embedding"`, the same encoders without them.
+        encoder: `"conv"` or `"spiking"`; that of the model's name when None.
 
     Returns:
         Model, training and hyper-parameters; change fields with `dataclasses.replace` and
@@ -111,8 +168,11 @@ def preset(
         ValueError: unknown preset, model or data set.
     """
     check_choice("preset", name, PRESETS)
-    check_choice("model", model, MODELS)
+    model, encoder = recipe_and_encoder(model, encoder)
     heads = [of for data, of in _BY_DATASET if data == dataset.name]
+    if encoder != "conv":
+        # The other heads read tables of their own encoders.
+        heads = [of for of in heads if of == "dense"]
     if not heads:
         names = ", ".join(dict.fromkeys(data for data, _ in _BY_DATASET))
         raise ValueError(
@@ -121,7 +181,7 @@ def preset(
         )
     head = heads[0] if head is None else head
     check_choice("head", head, heads)
-    base = _BY_DATASET[dataset.name, head]
+    base = _with_encoder(_BY_DATASET[dataset.name, head], dataset, encoder)
     reference = dataclasses.replace(
         base.model,
         model="argate_l",
@@ -130,14 +190,14 @@ def preset(
         n_classes=dataset.n_classes,
     )
     if dataset.n_time == 1:
-        encoder = base.model.encoder
-        if encoder.scalar == "table":
+        encoders = base.model.encoder
+        if encoders.scalar == "table":
             levels = reading_levels(dataset.train_x, limit=4 * BINS)
             ranks = reading_ranks(dataset.train_x, levels)
-            encoder = dataclasses.replace(encoder, levels=levels, ranks=ranks)
+            encoders = dataclasses.replace(encoders, levels=levels, ranks=ranks)
         elif dataset.name != "own" or readings_recur(dataset.train_x):
-            encoder = dataclasses.replace(encoder, levels=reading_levels(dataset.train_x))
-        reference = dataclasses.replace(reference, encoder=encoder)
+            encoders = dataclasses.replace(encoders, levels=reading_levels(dataset.train_x))
+        reference = dataclasses.replace(reference, encoder=encoders)
     config = match_parameters(dataclasses.replace(reference, model=model), reference)
     train, hyper = base.train, base.hyper
     if MODELS[model].printed:

@@ -23,6 +23,7 @@ from fusion.failures import Protocol, corrupt
 from fusion.losses import LossTerms, argate_loss, cross_entropy, mask_penalty
 from fusion.models import MainOutput, Params, auxiliary_logits, export, init, predict
 from fusion.neighbours import recall, remember
+from fusion.spiking.reward_stdp import reward_gradient
 from fusion.targets import apply_targets, project_targets
 
 
@@ -118,6 +119,9 @@ def batch_loss(
     if model.variational:
         apart = gate_divergence(params["main"]["gate"], model.gate_prior) / (n_examples or len(y))
         loss = loss._replace(total=loss.total + hyper.loss.divergence * apart)
+    if model.encoder.learns_by_reward and aux_losses is not None:
+        rewarded = reward_gradient(model.encoder, params["main"]["encoder"], x, aux_losses)
+        loss = loss._replace(total=loss.total + rewarded)
     return loss.total, (loss, out)
 
 

@@ -49,6 +49,7 @@ SAME_MEANING = {
     "reference": "a circuit in ngspice",
     "schematic": "a circuit as drawn",
     "status": "how a run ended, and what to do about it",
+    "neurons": "leaky integrate-and-fire neurons: in volts and seconds there, learning here",
     "network": "neurons or filters and their connections",
     "geometry": "shapes, distances and overlaps",
     "__main__": "what `python -m` runs",

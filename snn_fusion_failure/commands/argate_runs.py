@@ -32,7 +32,9 @@ class Config:
     """Your own windows instead: .npz with x, y and optional groups, channels, classes."""
     model: str = "argate_l"
     """baseline, netgated, argate_ws, argate_plus, argate_l; *_printed (to the letter); or
-    equal_weights, modality_dropout, embracenet, oracle."""
+    equal_weights, modality_dropout, embracenet, oracle; spiking_argate and others of spiking_*."""
+    encoder: str | None = None
+    """conv or spiking, for any model; the model's own when left out."""
     head: str | None = None
     """dense; for driver also neighbourhood (its default) and embedding."""
     gate: Literal["deterministic", "bayesian", "bayesian_whole"] = "deterministic"
@@ -95,7 +97,8 @@ def build_settings(config: Config, dataset: Dataset) -> Preset:
     """Preset with the command line's changes, for a loaded data set."""
     from fusion.presets import Preset, preset
 
-    parts: dict[str, Any] = preset(dataset, config.model, config.preset, head=config.head)._asdict()
+    given = {name: getattr(config, name) for name in ("head", "encoder")}
+    parts: dict[str, Any] = preset(dataset, config.model, config.preset, **given)._asdict()
     named = {
         "train.epochs": config.epochs,
         "hyper.learning_rate": config.learning_rate,
@@ -107,8 +110,8 @@ def build_settings(config: Config, dataset: Dataset) -> Preset:
         "model.gate_kind": config.gate.replace("bayesian", "variational"),
         "model.loss.mask_supervision": "true" if config.mask_supervision else None,
     }
-    given = [f"{name}={value}" for name, value in named.items() if value is not None]
-    return Preset(**apply_changes(parts, [*given, *config.changes]))
+    asked = [f"{name}={value}" for name, value in named.items() if value is not None]
+    return Preset(**apply_changes(parts, [*asked, *config.changes]))
 
 
 def _protocols(config: Config, dataset: Dataset, name: ProtocolName) -> tuple[Any, Any, str]:

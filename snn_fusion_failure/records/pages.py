@@ -36,6 +36,10 @@ PARTS = (
 )
 """What the summary has a line for, and the source's tables of it."""
 
+CHAPTER_5 = "Chapter 5: proposed there, built here"
+PROPOSED = ("study_spiking_fusion", "study_rev_conv", "study_bayesian_gate")
+"""Files of record of the systems that the source's last chapter proposes."""
+
 
 def load(path: Path) -> dict[str, Any]:
     """A file of record."""
@@ -61,16 +65,18 @@ def table_section(results: Path, path: Path, source: dict[str, Any]) -> str:
     return "\n\n".join(part for part in parts if part)
 
 
-def study_section(docs: Path, path: Path) -> str:
+def study_section(docs: Path, path: Path, level: str = "##") -> str:
     """Any other file of record: its rows if they have the schema, else where to find it."""
     study = load(path)
     rows = [row for row in study.get("rows", []) if {"row", "model", "metric"} <= set(row)]
-    parts = [f"## {study.get('title', path.stem)}"]
+    parts = [f"{level} {study.get('title', path.stem)}"]
     picture = docs / "images" / f"{path.stem}.png"
     if picture.exists():
         parts.append(f"![{study.get('title', path.stem)}](images/{picture.name})")
     listed = f"The numbers are in `results/{path.name}`."
     parts.append(markdown.measured(rows) if rows else listed)
+    if compared := study.get("comparisons"):
+        parts.append(markdown.comparisons({"rows": compared}, None))
     parts.append(markdown.provenance(study))
     return "\n\n".join(parts)
 
@@ -80,7 +86,11 @@ def page(results: Path, docs: Path, source: dict[str, Any]) -> str:
     tables, studies = files(results)
     parts = [INTRODUCTION.strip(), markdown.SPREAD_LINE]
     parts += [table_section(results, path, source) for path in tables]
-    parts += [study_section(docs, path) for path in studies]
+    proposed = [path for path in studies if path.stem in PROPOSED]
+    if proposed:
+        parts.append(f"## {CHAPTER_5}")
+        parts += [study_section(docs, path, "###") for path in proposed]
+    parts += [study_section(docs, path) for path in studies if path not in proposed]
     return "\n\n".join(parts) + "\n"
 
 

@@ -254,3 +254,18 @@ def test_units_stand_in_the_heading_or_in_the_cells() -> None:
 def test_markers_in_the_wrong_order_are_refused() -> None:
     with pytest.raises(ValueError, match="in this order"):
         markdown.replace_block("<!-- a:end --><!-- a:begin -->", "a", "new")
+
+
+def test_systems_of_chapter_5_have_a_chapter_of_their_own(config: render_results.Config) -> None:
+    compared = {"row": "clean", "comparison": "spiking_argate - argate_l", "n": 5}
+    compared |= {"difference": -1.25, "low": -2.0, "high": -0.5, "p_value": 0.01}
+    path = config.results / "study_spiking_fusion.json"
+    write_json(path, STUDY | {"title": "Spikes", "comparisons": [compared]})
+    render_results.main(config)
+    page = (config.docs / "results.md").read_text()
+    chapter, spikes, other = (
+        page.index(text) for text in (f"## {pages.CHAPTER_5}", "### Spikes", "## A study of steps")
+    )
+    assert chapter < spikes < other
+    line = _line(page, "| clean | spiking_argate - argate_l |")
+    assert "-1.25 [-2.00, -0.50] | 0.010 | 5 |" in line

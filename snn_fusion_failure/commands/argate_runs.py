@@ -126,11 +126,8 @@ def _protocols(config: Config, dataset: Dataset, name: ProtocolName) -> tuple[An
     if name == "generalisation":
         train, test = (getattr(config, n) or default for n, default in RANGES.items())
         pair = failures.generalisation(dataset.channels, train, test)
-        return (
-            *pair,
-            f"{train[0]} to {train[1]} of {k} sensors fail in training, {test[0]} to {test[1]} in "
-            "test",
-        )
+        title = "{} to {} of {k} sensors fail in training, {} to {} in test"
+        return (*pair, title.format(*train, *test, k=k))
     n_clean = config.n_clean
     if n_clean is None:
         n_clean = N_CLEAN.get(dataset.name, (k + 1) // 2) if name == "random" else 5

@@ -45,8 +45,15 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 	@echo "== running the default test suite on $(JOBS) workers"
 	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile
 
-slow: $(VENV)/.dev  ## a third of the long tests, another third every day
-	$(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
+# The peer that the spiking networks are compared with; where it cannot be had, its test says so.
+.cache/brian2/bin/python:
+	@echo "== installing Brian 2 into .cache/brian2"
+	@$(PYTHON) -m venv .cache/brian2 && { .cache/brian2/bin/pip install -q --disable-pip-version-check \
+	  'numpy<2.3' 'brian2>=2.9' || echo "Brian 2 could not be installed"; }
+
+slow: $(VENV)/.dev .cache/brian2/bin/python  ## a third of the long tests, another third every day
+	BRIAN2_PYTHON=$(CURDIR)/.cache/brian2/bin/python \
+	  $(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
 
 mutate: $(VENV)/.dev  ## break the code in some seventy places, one at a time: tests must notice
 	$(BIN)/python scripts/tools/mutate.py

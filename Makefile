@@ -80,7 +80,7 @@ lowest: $(VENV)/.dev  ## a few test files with the lowest allowed versions, in a
 newer: $(VENV)/.dev  ## the same test files with a newer Python, in an environment of their own
 	$(BIN)/python scripts/tools/check_lowest.py --python $(NEWER) --versions constraints
 
-check: lint types docs wheel test slow commands lowest  ## everything; CI runs a part of commands and leaves slow and lowest out
+check: lint types docs wheel test slow commands lowest  ## everything that CI runs
 
 clean:  ## remove what the other commands made, but not runs/ or results/
 	rm -rf $(VENV) .cache site build dist .pytest_cache .mypy_cache .ruff_cache

@@ -157,6 +157,7 @@ def test_samples_of_the_box_converge() -> None:
     assert I_HEAVY > 0
 
 
+@pytest.mark.slow
 def test_a_gradient_program_gives_the_same_values_and_the_slopes_of_differences() -> None:
     """One batch for both sides; three columns of transistors that matter, one that hardly does."""
     circuit = circuits.get("ldo")

@@ -4,14 +4,14 @@
     python scripts/studies/study_lifelong.py --models S4_guided S4 --seeds 16
 
 A robot learns 20 trials on a map and is tested there with frozen weights (`sr_before`). Then
-something changes: `dead sonar`, the inner left sonar reports an obstacle at 20 px for ever (one that
-reports its full range costs a fixed rule nothing on these maps: 95 to 100 % stay); `new map`,
+something changes: `dead sonar`, the inner left sonar reports an obstacle at 20 px for ever (one
+that reports its full range costs a fixed rule nothing on these maps: 95 to 100 % stay); `new map`,
 another map; `weak motor`, the right motor makes 80 % of its rate. `sr_after_frozen` is success in
 the changed world without a change of the weights, `sr_after_plastic` after 20 more learning trials
-in it, from the same starts, weights frozen in the test, and `sr_fresh` that of a naive network after
-20 trials in the changed world alone. Drivers have nothing to learn: their numbers after the change
-are the same. Rows go to `results/study_lifelong.json` as each one ends and
-are skipped when they are there with as many seeds. About 40 CPU-seconds per robot and row.
+in it, from the same starts, weights frozen in the test, and `sr_fresh` that of a naive network
+after 20 trials in the changed world alone. Drivers have nothing to learn: their numbers after the
+change are the same. Rows go to `results/study_lifelong.json` as each one ends and are skipped when
+they are there with as many seeds. About 40 CPU-seconds per robot and row.
 """
 
 from __future__ import annotations

@@ -49,7 +49,7 @@ class Config:
 
     only: tuple[str, ...] = ()
     """Parts of file names; all edits when left out."""
-    timeout: float = 300.0
+    timeout: float = 120.0
     """Seconds after which tests that a mutant keeps busy are ended; it counts as noticed."""
 
 

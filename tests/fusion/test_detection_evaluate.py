@@ -157,7 +157,8 @@ def test_range_bins_count_objects_and_false_alarms_of_a_bin() -> None:
     def at(z: float, **changes: object) -> Objects:
         return car(location=[0.0, 1.7, z], **changes)
 
-    labels, found = [at(10.0), at(25.0), at(60.0)], [at(10.0), at(25.0), at(60.0), at(35.0)]
+    # An object at the border belongs to the farther bin.
+    labels, found = [at(10.0), at(20.0), at(60.0)], [at(10.0), at(20.0), at(60.0), at(35.0)]
     place = {"bbox": [500.0, 100.0, 600.0, 200.0]}
     found[3] = at(35.0, **place)
     frames = [concatenate(labels)], [concatenate(found)]

@@ -43,15 +43,14 @@ _CIRCUITS = ("4.1", "4.2")
 DIFFERENCES = (
     Difference(
         _ROBOTS,
-        "steering movements count the way to the target, and the drawings of the source's maps are "
-        "lost: ours are other maps",
-        metric="n_mv",
-    ),
-    Difference(
-        _ROBOTS,
         "the source gives neither the rewards of its Q-learning nor drawings of its maps: ours is "
         "another learner on other maps",
         model="Q-learning",
+    ),
+    Difference(
+        _ROBOTS,
+        "the drawings of the source's maps are lost, and ours are easier: on Scenario 1 and 2 a "
+        "driver that looks at no sonar arrives in 100 and 93 % of the trials; see the detours",
     ),
     Difference(
         ("3.4", "3.5", "3.6"),

@@ -70,6 +70,11 @@ RULES = (
         forget="results/study_detour.json",
     ),
     Rule(
+        "study_guidance.py",
+        "--samples 2 --maps 1 --test-maps 1 --robots 1 --trials 1",
+        forget="results/study_guidance.json",
+    ),
+    Rule(
         "study_lifelong.py",
         f"{_ROBOT} --models blind --rows 'weak motor' --trials 1",
         forget="results/study_lifelong.json",
@@ -225,7 +230,7 @@ AREAS = {
     ),
     "robots": (
         "train_snn", "study_transfer", "study_snn", "figures_snn", "compare_snn", "bench_snn",
-        "train_rl", "study_detour", "study_lifelong",
+        "train_rl", "study_detour", "study_guidance", "study_lifelong",
     ),
     "sweeps": ("sweep", "bench_sweep"),
     "fusion": (

@@ -111,7 +111,7 @@ def gradient_of(circuit: Any, x: Any, config: Config) -> dict[str, Any]:
         at = jnp.asarray(x)
         forward = jax.jit(circuit.run)
         # A program that is in the cache would not be compiled.
-        held = jax.config.jax_enable_compilation_cache
+        held = jax.config.values["jax_enable_compilation_cache"]
         jax.config.update("jax_enable_compilation_cache", False)
         start = time.process_time()
         program = gradient_program(circuit, column).lower(at).compile()

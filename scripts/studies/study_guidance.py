@@ -59,11 +59,12 @@ def draw(config: Config) -> Any:
     from jaxsnn.turn_goal import TurnGoalParams
 
     rng = np.random.default_rng(config.seed)
-    drawn = {k: rng.choice(v, config.samples).astype(np.float32) for k, v in GRID.items()}
+    n = config.samples
+    drawn: dict[str, Any] = {k: rng.choice(v, n).astype(np.float32) for k, v in GRID.items()}
     before = TurnGoalParams()._asdict()
     for name, values in drawn.items():
         values[0] = before[name]
-    held = {k: np.full(config.samples, v, np.float32) for k, v in before.items() if k not in drawn}
+    held: Any = {k: np.full(n, v, np.float32) for k, v in before.items() if k not in drawn}
     return TurnGoalParams(**drawn, **held)
 
 
@@ -104,8 +105,8 @@ def main(config: Config) -> dict[str, Any]:
             for number in range(config.maps):
                 map = families.family_map(family, "validation", number)
                 scores.append(success(config, params, map, config.trials).mean(axis=1))
-                best = f"best so far {np.mean(scores, axis=0).max():.0f} %"
-                bar.update(task, advance=1, status=best)
+                status = f"best so far {np.mean(scores, axis=0).max():.0f} %"
+                bar.update(task, advance=1, status=status)
     score = np.mean(scores, axis=0)
     best = int(np.argmax(score))
     chosen = {name: float(getattr(params, name)[best]) for name in GRID}
@@ -113,7 +114,7 @@ def main(config: Config) -> dict[str, Any]:
     tests = {name: success(config, two, named_map(name), 10) for name in TESTS}
     unseen = [families.family_map("detour", "test", i) for i in range(config.test_maps)]
     tests["held-out detour family"] = np.mean([success(config, two, m, 1) for m in unseen], axis=0)
-    tests["validation families"] = np.array(scores)[:, [0, best]].T
+    tests["validation families"] = np.array(scores).T[np.array([0, best])]
     rows = [
         {"row": row, "model": model, "metric": "sr_testing", "unit": "%", **summarize(v.tolist())}
         for row, values in tests.items()

@@ -20,6 +20,7 @@ from fusion.data.dataset import Dataset, Scale, apply_scale
 from fusion.loop import Corruption, test_output
 from fusion.models import Params, check_windows, export, predict
 from fusion.monitor import MonitorParams, failure_probability, fit_monitor
+from fusion.predictive_scores import fit_temperature
 from fusion.train import TrainState
 
 FORMAT = 1
@@ -183,24 +184,6 @@ class FittedARGate:
         )
 
 
-def _temperature(logits: Float[np.ndarray, "n c"], labels: np.ndarray) -> float:
-    r"""The T that minimizes the cross entropy of `softmax(logits / T)`; between 0.05 and 20.
-
-    Source: Guo et al. (2017).
-    """
-    from scipy.optimize import minimize_scalar
-    from scipy.special import log_softmax
-
-    rows = np.arange(len(labels))
-    logits = np.asarray(logits, np.float64)
-
-    def loss(log_t: float) -> float:
-        return -float(log_softmax(logits / np.exp(log_t), axis=1)[rows, labels].mean())
-
-    found = minimize_scalar(loss, bounds=(np.log(0.05), np.log(20.0)), method="bounded")
-    return float(np.exp(found.x))
-
-
 def finish(
     model: ModelConfig,
     state: TrainState,
@@ -246,5 +229,5 @@ def finish(
         classes=data.classes,
         monitor=monitor,
         false_alarm_rate=false_alarm_rate,
-        temperature=_temperature(output.logits, output.labels),
+        temperature=fit_temperature(output.logits, output.labels),
     )

@@ -146,3 +146,26 @@ def aurc(confidence: ArrayLike, right: ArrayLike) -> float:
         0.1111
     """
     return float(risk_coverage(confidence, right).risk.mean())
+
+
+def fit_temperature(logits: ArrayLike, labels: ArrayLike) -> float:
+    r"""The T that minimizes the cross entropy of `softmax(logits / T)`; between 0.05 and 20.
+
+    Args:
+        logits: `[n, class]` of held-out rows, or logarithms of probabilities.
+        labels: their classes.
+
+    Source: Guo et al. (2017).
+    """
+    from scipy.optimize import minimize_scalar
+    from scipy.special import log_softmax
+
+    y = np.asarray(labels)
+    rows = np.arange(len(y))
+    z = np.asarray(logits, np.float64)
+
+    def loss(log_t: float) -> float:
+        return -float(log_softmax(z / np.exp(log_t), axis=1)[rows, y].mean())
+
+    found = minimize_scalar(loss, bounds=(np.log(0.05), np.log(20.0)), method="bounded")
+    return float(np.exp(found.x))

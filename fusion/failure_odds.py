@@ -23,6 +23,8 @@ SHARED = 0.3
 """Share of the covariance over all classes in that of each class."""
 FLOOR = 0.1
 """Least standard deviation of a statistic given the others, as a share of its own."""
+RIDGE = 1e-3
+"""Weight of the squared slope in the calibration."""
 N_STATISTICS = 7
 
 
@@ -126,11 +128,11 @@ def fit_working(
         mixed = (1.0 - SHARED) * own + SHARED * pooled
         covariances.append(mixed + np.einsum("kd,de->kde", floor, np.eye(N_STATISTICS)))
     stacked = np.stack(covariances)
-    f32 = (jnp.asarray(a, jnp.float32) for a in (means, np.linalg.inv(stacked)))
-    log_det = jnp.asarray(np.linalg.slogdet(stacked)[1], jnp.float32)
+    given = means, np.linalg.inv(stacked), np.linalg.slogdet(stacked)[1]
+    mean, precision, log_det = (jnp.asarray(a, jnp.float32) for a in given)
     k = s.shape[1]
     one, zero = jnp.ones(()), jnp.zeros(())
-    plain = WorkingModel(*f32, log_det, jnp.zeros(k), jnp.ones(k), one, zero)
+    plain = WorkingModel(mean, precision, log_det, jnp.zeros(k), jnp.ones(k), one, zero)
     own = jax.nn.one_hot(jnp.asarray(y), n_classes)
     return _standardize(plain, np.asarray(jax.jit(novelty)(plain, x, own)))
 
@@ -228,7 +230,9 @@ def calibrate_failures(
     sign = np.where(mask.ravel(), -1.0, 1.0)
 
     def loss(ab: np.ndarray) -> float:
-        return float(np.logaddexp(0.0, sign * (np.exp(ab[0]) * u + ab[1])).mean())
+        slope = np.exp(ab[0])
+        # Where the two are told apart wholly, the likelihood alone has no maximum.
+        return float(np.logaddexp(0.0, sign * (slope * u + ab[1])).mean() + RIDGE * slope**2)
 
     log_slope, offset = minimize(loss, np.zeros(2), method="Nelder-Mead").x
     return params._replace(slope=jnp.float32(np.exp(log_slope)), offset=jnp.float32(offset))

@@ -82,14 +82,16 @@ def predictors(
     draw = jax.jit(uncertainty.sample_predictive, static_argnums=0)
     once = jax.jit(uncertainty.one_pass_predictive, static_argnums=0)
     main = mains["argate_l"]
-    return {
+    found: dict[str, Callable[..., Any]] = {
         "argate_l": softmax,
         "mc_dropout": lambda x, *, key: dropout(plain, main, x, key=key),
         "laplace": lambda x, *, key: around(plain, main, laplace, x, key=key),
-        "ensemble": lambda x, *, key: mixture(plain, mains["ensemble"], x),
         "bayesian (samples)": lambda x, *, key: draw(bayes, mains["bayesian"], x, key=key),
         "bayesian (one pass)": lambda x, *, key: once(bayes, mains["bayesian"], x),
     }
+    if "ensemble" in mains:
+        found["ensemble"] = lambda x, *, key: mixture(plain, mains["ensemble"], x)
+    return found
 
 
 def fit_gaussian(config: Any, main: Any, dataset: Any, noise: Any, *, key: Any) -> Any:

@@ -47,6 +47,7 @@ MEMBERS = 3
 CHOSEN = {"gate_prior": 0.1, "divergence": 0.1}
 """The likeliest setting on validation rows whose weights still tell failed sensors, see `GRID`."""
 GRID = [{"gate_prior": p, "divergence": d} for p in (1.0, 0.1) for d in (1.0, 0.1, 0.01)]
+GRID += [CHOSEN | {"label_smoothing": 0.0}]
 """What `--choose` compares."""
 
 
@@ -84,6 +85,9 @@ def settings_of(dataset: Any, preset: str, network: str, **constants: float) -> 
         model = dataclasses.replace(
             found.model, gate_kind="variational", gate_prior=constants["gate_prior"]
         )
+        smoothing = constants.get("label_smoothing", model.recipe.loss.label_smoothing)
+        terms = dataclasses.replace(model.recipe.loss, label_smoothing=smoothing)
+        model = dataclasses.replace(model, loss=terms)
         loss = found.hyper.loss._replace(divergence=constants["divergence"])
         return found._replace(model=model, hyper=found.hyper._replace(loss=loss))
     return found
@@ -147,6 +151,7 @@ def choose(config: Config, dataset: Any) -> list[dict[str, Any]]:
     for constants in GRID:
         settings = settings_of(dataset, config.preset, "bayesian", **constants)
         name = f"prior={constants['gate_prior']:g} divergence={constants['divergence']:g}"
+        name += " label_smoothing=0" if "label_smoothing" in constants else ""
         path = config.out / config.preset / "choice" / f"{name.replace(' ', '_')}.npz"
         main = trained(path, settings, dataset, noise, jax.random.key(0))
         found = draw(settings.model, main, x, key=jax.random.key(1))

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Mapping
 from typing import Any
 
@@ -11,7 +12,13 @@ import numpy as np
 
 CHUNK = 512
 CLASS_METRICS = ("accuracy", "nll", "ece", "brier", "aurc")
-SCALED = ("argate_l", "ensemble", "bayesian (samples)", "bayesian (one pass)")
+SCALED = (
+    "argate_l",
+    "argate_l_unsmoothed",
+    "ensemble",
+    "bayesian (samples)",
+    "bayesian (one pass)",
+)
 """Models that are also scored with a temperature from validation rows."""
 LAPLACE_PRIORS = (1.0, 0.1)
 SEEN_KINDS = ("uniform", "gaussian")
@@ -70,8 +77,8 @@ def predictors(
 
     plain, bayes = configs["argate_l"], configs["bayesian"]
 
-    def softmax(x: Any, *, key: Any) -> Any:
-        out = _predict(plain, mains["argate_l"], x)
+    def softmax(x: Any, *, key: Any, name: str = "argate_l") -> Any:
+        out = _predict(configs[name], mains[name], x)
         p = jax.nn.softmax(out.logits, axis=-1)
         return uncertainty.Predictive(p, out.weights, out.weights, out.weights, p[:, 0], p[:, 0])
 
@@ -89,6 +96,8 @@ def predictors(
         "bayesian (samples)": lambda x, *, key: draw(bayes, mains["bayesian"], x, key=key),
         "bayesian (one pass)": lambda x, *, key: once(bayes, mains["bayesian"], x),
     }
+    if "argate_l_unsmoothed" in mains:
+        found["argate_l_unsmoothed"] = functools.partial(softmax, name="argate_l_unsmoothed")
     if "ensemble" in mains:
         found["ensemble"] = lambda x, *, key: mixture(plain, mains["ensemble"], x)
     return found

@@ -37,7 +37,10 @@ PARTS = (
 """What the summary has a line for, and the source's tables of it."""
 
 CHAPTER_5 = "Chapter 5: proposed there, built here"
-PROPOSED = ("study_spiking_fusion", "study_rev_conv", "study_bayesian_gate")
+PROPOSED = (
+    *("study_spiking_fusion", "study_rev_conv", "study_bayesian_gate"),
+    "study_bayesian_gate_choice",
+)
 """Files of record of the systems that the source's last chapter proposes."""
 
 

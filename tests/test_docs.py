@@ -43,7 +43,7 @@ def blocks(page: Path) -> list[tuple[bool, str, int]]:
 
 
 # These train networks for half a minute each.
-LONG = ("argate_in_flax", "own_data", "brax_ppo", "lattice_in_flax")
+LONG = ("bayesian_gate", "argate_in_flax", "own_data", "brax_ppo", "lattice_in_flax")
 
 
 def with_marks(page: Path) -> Any:

@@ -62,7 +62,17 @@ READINGS["guided"] = {
         **READINGS["tuned"]["params"],
         "max_turn": 60.0,
         "anneal": 500.0,
-        "goal": TurnGoalParams(),
+        # The best of 1,024 sets on validation maps (results/study_guidance.json).
+        "goal": TurnGoalParams(
+            side=120.0,
+            diagonal=60.0,
+            front=60.0,
+            blocked=180.0,
+            avoid=30.0,
+            towards=45.0,
+            commitment=0.5,
+            memory=0.97,
+        ),
     },
     "stdp": READINGS["tuned"]["stdp"],
     "reward": READINGS["tuned"]["reward"],

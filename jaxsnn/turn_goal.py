@@ -18,7 +18,7 @@ from jaxsnn.world import Reading
 
 
 class TurnGoalParams(NamedTuple):
-    """Constants of the graded reward; chosen on validation maps of `jaxsnn.families`.
+    """Constants of the graded reward; the reading "guided" has those chosen on validation maps.
 
     Attributes:
         side, diagonal, front: distance at which the outer, inner and front sonars ask for a turn

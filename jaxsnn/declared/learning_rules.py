@@ -192,6 +192,7 @@ class RewardSTDP(PairSTDP):
     ) -> tuple[PairTraces, Float[Array, "n_pre n_post"]]:
         """One step of traces, eligibility and weights under a reward for each edge."""
         state, pairs = self._pairs(state, arrived, post, dt)
+        assert state.z is not None  # `init` of this class makes one
         z = state.z * jnp.exp(-dt / self.tau_z) + pairs / self.tau_z
         return state._replace(z=z), self._changed(weights, self.gamma * dt * reward * z)
 

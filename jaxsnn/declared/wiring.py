@@ -107,8 +107,8 @@ def declare(
             part.neuron.check(dt)
     edges = {name: _edges(name, part, populations) for name, part in projections.items()}
     depth = dict.fromkeys(populations, 1)
-    for name, part in projections.items():
-        depth[part.pre] = max(depth[part.pre], int(edges[name].delay.max()))
+    for name, synapses in projections.items():
+        depth[synapses.pre] = max(depth[synapses.pre], int(edges[name].delay.max()))
     return Wiring(dt, dict(populations), dict(projections), edges, depth)
 
 

@@ -99,16 +99,24 @@ ENCODED: dict[str, tuple[str, str]] = {
 }
 """Names of a recipe with an encoder; any other pair is had by `encoder`."""
 
-# Neurons and the sizes that go with them; chosen on validation rows, see docs/spiking_fusion.md.
-_SPIKING: dict[str, tuple[SpikingConfig, dict[str, Any]]] = {
+# Neurons, sizes of the network and training that go with them; chosen on validation rows, see
+# docs/spiking_fusion.md. Gains that vary in training stand for the gaits of other people.
+_SPIKING: dict[str, tuple[SpikingConfig, dict[str, Any], dict[str, Any]]] = {
     "har": (
-        SpikingConfig(widths=(24, 48), taps=(8, 4), strides=(4, 2)),
-        {"head_widths": (96,), "gate_width": 32},
+        SpikingConfig(widths=(16, 32), taps=(8, 12), strides=(4, 2), threshold=0.7),
+        {"head_widths": (64,), "gate_width": 32},
+        {"epochs": 15, "jitter": 0.3},
     ),
-    "driver": (SpikingConfig(widths=(24, 24), taps=(1, 1), strides=(1, 1), steps=16), {}),
-    "simulated": (SpikingConfig(widths=(12, 24), taps=(4, 4), strides=(2, 2)), {}),
-    "own": (SpikingConfig(widths=(16, 32), taps=(1, 4), strides=(1, 1)), {}),
+    "driver": (SpikingConfig(widths=(24, 24), taps=(1, 1), strides=(1, 1)), {}, {}),
+    "simulated": (
+        SpikingConfig(widths=(16, 24), taps=(8, 6), strides=(2, 2), threshold=0.5),
+        {},
+        {},
+    ),
+    "own": (SpikingConfig(widths=(16, 32), taps=(4, 4), strides=(1, 1)), {}, {}),
 }
+_SPIKING_RATE = {"har": 5e-3}
+"""Learning rates where they are not those of the data set's preset."""
 
 
 def recipe_and_encoder(model: str, encoder: str | None = None) -> tuple[str, str]:
@@ -137,9 +145,14 @@ def _with_encoder(base: Preset, dataset: Dataset, encoder: str) -> Preset:
     """The preset with another encoder, and with the sizes that go with it."""
     if encoder == "conv":
         return base
-    spiking, changes = _SPIKING[dataset.name]
+    spiking, sizes, training = _SPIKING[dataset.name]
     series = dataclasses.replace(base.model.encoder, series=encoder, spiking=spiking)
-    return base._replace(model=dataclasses.replace(base.model, encoder=series, **changes))
+    rate = _SPIKING_RATE.get(dataset.name, base.hyper.learning_rate)
+    return Preset(
+        dataclasses.replace(base.model, encoder=series, **sizes),
+        dataclasses.replace(base.train, **training),
+        base.hyper._replace(learning_rate=rate),
+    )
 
 
 def preset(

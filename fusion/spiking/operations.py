@@ -164,7 +164,9 @@ def count_spikes(
     return operations, spikes
 
 
-def cost(config: ModelConfig, main: Params, x: Float[Array, "b k t"], *, batch: int = 256) -> Cost:
+def cost(
+    config: ModelConfig, main: Params, x: Float[Array | np.ndarray, "b k t"], *, batch: int = 256
+) -> Cost:
     """Mean cost of an inference on given windows.
 
     Args:
@@ -182,7 +184,9 @@ def cost(config: ModelConfig, main: Params, x: Float[Array, "b k t"], *, batch: 
         count = jax.jit(
             lambda params, x: count_spikes(config.encoder, activity_of(config.encoder, params, x))
         )
-        found = [count(main["encoder"], x[i : i + batch]) for i in range(0, len(x), batch)]
+        found = [
+            count(main["encoder"], jnp.asarray(x[i : i + batch])) for i in range(0, len(x), batch)
+        ]
         operations, spikes = (
             float(np.mean(np.concatenate(part))) for part in zip(*found, strict=True)
         )

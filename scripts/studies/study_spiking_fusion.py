@@ -39,8 +39,8 @@ _FIXED = ("model.encoder.spiking.learning=fixed", "model.head_widths=[]")
 _REWARD = ("model.encoder.spiking.learning=reward_stdp",)
 # As few multiply-adds as the spiking networks have operations of both kinds.
 _SMALL = (
-    *("model.encoder.features=12", "model.encoder.conv_features=[4, 8]"),
-    *("model.encoder.spectral=true", "model.head_widths=[64]", "model.gate_width=16"),
+    *("model.encoder.features=16", "model.encoder.conv_features=[8, 16]"),
+    "model.head_widths=[64]",
 )
 COLUMNS: dict[str, tuple[str, tuple[str, ...], str | None]] = {
     "baseline": ("baseline", (), None),

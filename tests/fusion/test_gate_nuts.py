@@ -100,8 +100,8 @@ def test_variation_and_laplace_predict_as_nuts_does(problem: Any) -> None:
     found = sample_predictive(
         CLOUD, with_split(main, fitted), new, key=jax.random.key(2), n_draws=2000
     )
-    np.testing.assert_allclose(found.probabilities, wanted, atol=0.05)
-    np.testing.assert_allclose(found.weights, weights, atol=0.12)
+    np.testing.assert_allclose(found.probabilities, wanted, atol=0.04)
+    np.testing.assert_allclose(found.weights, weights, atol=0.06)
     width = np.asarray(found.weight_high - found.weight_low) / 3.29
     # Independent parameters cannot trade with each other: right in size, not to the digit.
     assert 0.6 < float(np.median(width / spread)) < 1.6
@@ -117,6 +117,8 @@ def test_variation_and_laplace_predict_as_nuts_does(problem: Any) -> None:
     laplace = fit_laplace(POINT, at_mode, x)
     around = laplace_predictive(POINT, at_mode, laplace, new, key=jax.random.key(3), n_draws=2000)
     np.testing.assert_allclose(around.probabilities, wanted, atol=0.06)
-    point = np.asarray(jax.nn.softmax(predict(POINT, at_mode, new).logits))
-    # What a distribution is for: nearer to the posterior's prediction than its mode is.
-    assert np.abs(found.probabilities - wanted).mean() < np.abs(point - wanted).mean()
+    width = np.asarray(around.weight_high - around.weight_low) / 3.29
+    assert 0.5 < float(np.median(width / spread)) < 1.2
+    # What a distribution is for: expected weights nearer to the posterior's than the mode's are.
+    point = np.asarray(predict(POINT, at_mode, new).weights)
+    assert np.abs(found.weights - weights).mean() < np.abs(point - weights).mean()

@@ -122,10 +122,10 @@ class VariationalDense(nn.Module):
         sd = self.prior * jnp.exp(self.param("kernel_spread", spread, shape))
         bias_sd = self.prior * jnp.exp(self.param("bias_spread", spread, shape[1:]))
         square = mean**2 if variance is None else mean**2 + variance
-        spread_out = square @ sd**2 + bias_sd**2
+        spread_out = square @ sd**2 + (bias_sd**2)[None, :]
         if variance is not None:
             spread_out = spread_out + variance @ kernel**2
-        return mean @ kernel + bias, spread_out
+        return mean @ kernel + bias[None, :], spread_out
 
 
 class VariationalGate(nn.Module):

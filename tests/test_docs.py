@@ -42,8 +42,11 @@ def blocks(page: Path) -> list[tuple[bool, str, int]]:
     ]
 
 
-# These train networks for half a minute each.
-LONG = ("bayesian_gate", "argate_in_flax", "own_data", "brax_ppo", "lattice_in_flax")
+# These compile or train for twenty seconds and more each.
+LONG = (
+    "bayesian_gate", "argate_in_flax", "own_data", "brax_ppo", "lattice_in_flax", "swap_reward",
+    "spiking_encoder",
+)  # fmt: skip
 
 
 def with_marks(page: Path) -> Any:

@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import functools
 import math
-from typing import get_args
+from typing import Any, get_args
 
 import jax
 import jax.numpy as jnp
@@ -70,7 +70,7 @@ def spike(
     Example:
         >>> spike(jnp.array([-0.1, 0.0, 0.1])).tolist()
         [0.0, 0.0, 1.0]
-        >>> float(jax.grad(spike)(0.0))
+        >>> float(jax.grad(spike)(jnp.zeros(())))
         1.0
     """
     check_choice("surrogate", surrogate, get_args(Surrogate))
@@ -79,7 +79,7 @@ def spike(
 
 @spike.defjvp
 def _spike_jvp(
-    surrogate: str, slope: float, primals: tuple[Array], tangents: tuple[Array]
+    surrogate: str, slope: float, primals: tuple[Any], tangents: tuple[Any]
 ) -> tuple[Array, Array]:
     (x,), (dx,) = primals, tangents
     return spike(x, surrogate, slope), surrogate_slope(jnp.asarray(x), surrogate, slope) * dx

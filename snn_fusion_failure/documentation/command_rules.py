@@ -113,6 +113,10 @@ RULES = (
         "study_spiking_fusion.py",
         "--preset quick --seeds 1 --models spiking_netgated --rows clean --results runs",
     ),
+    Rule(
+        "study_bayesian_gate.py",
+        "--preset quick --seeds 1 --networks argate_l bayesian --train-only",
+    ),
     Rule("bench_lattice.py", "--steps 2 --repeats 1"),
     Rule("simulate_kitti.py --picture", "--size tiny"),
     Rule("simulate_kitti.py", "--frames 2 --val 2 --test 2 --size tiny"),
@@ -235,7 +239,7 @@ AREAS = {
     "sweeps": ("sweep", "bench_sweep"),
     "fusion": (
         "train_argate", "watch_sensors", "study_argate", "study_sensors", "bench_fusion",
-        "study_spiking_fusion", "bench_lattice", "reproduce",
+        "study_spiking_fusion", "study_bayesian_gate", "bench_lattice", "reproduce",
     ),
     "circuits": (
         "find_failures", "study_failures", "study_active", "study_circuits", "study_parity",

@@ -21,6 +21,8 @@ BY_PATH = {
     "jaxsnn.navigation": "the robot as a task for PPO",
     "jaxsnn.ppo": "proximal policy optimisation",
     "jaxsnn.plots": "pictures (matplotlib)",
+    "fusion.failure_odds": "which sensors have failed, for kinds never trained on, too",
+    "fusion.uncertainty": "fusion weights with intervals, and windows that are left unanswered",
     "fusion.data.fixed": "the failing sensors that the source prints",
     "fusion.estimator": "ARGate with the face of scikit-learn",
     "fusion.modules": "ARGate and its loss around flax modules of one's own",

@@ -92,6 +92,7 @@ def test_ascent_beats_a_dense_random_search(surrogate):
     )
 
 
+@pytest.mark.slow
 def test_a_pbo_batch_runs_from_exploitation_to_exploration_inside_a_ball(surrogate):
     config, posterior, best = surrogate
     acq = acquisition.AcquisitionConfig(name="pbo", batch_size=3, n_raw=64, n_restarts=3)

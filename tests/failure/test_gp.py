@@ -84,6 +84,7 @@ def test_evidence_posterior_and_gradients_are_those_of_botorch(botorch_cases, ke
 
 
 @pytest.mark.relaxed
+@pytest.mark.slow
 def test_matern_and_rbf_are_those_of_tinygp(botorch_cases):
     from tinygp import GaussianProcess, kernels, transforms
 

@@ -92,6 +92,7 @@ def test_a_ringing_sample_is_simulated_again_with_finer_steps() -> None:
     assert np.abs(specs - trusted)[:, 1].max() < 2e-3
 
 
+@pytest.mark.slow
 def test_a_sample_alone_is_the_sample_in_a_batch(samples, solved) -> None:
     """Padding and chunks included: ten rows are two chunks when a chunk is eight."""
     from failure.circuits.protocol import in_chunks

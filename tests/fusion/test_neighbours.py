@@ -148,6 +148,7 @@ def test_an_unknown_reading_gives_the_token_and_the_flag_unless_switched_off(
         assert (float(jnp.abs(features[0, 0, :-1]).sum()) == 0.0) == known
 
 
+@pytest.mark.slow
 def test_a_trained_head_beats_the_largest_class_and_takes_absent_sensors(trained, data) -> None:  # type: ignore[no-untyped-def]
     config, noise, state = trained
     out = test_output(config, state, data, noise, key=jax.random.key(0))
@@ -171,6 +172,7 @@ def test_a_fitted_head_is_the_same_after_save_and_load(trained, data, tmp_path) 
 
 
 @pytest.mark.relaxed  # optax
+@pytest.mark.slow
 def test_fit_and_make_train_draw_the_same_network(trained, data) -> None:  # type: ignore[no-untyped-def]
     config, noise, state = trained
     run = make_train(config, TrainConfig(epochs=6, batch_size=50), len(data.train_y), noise.train)

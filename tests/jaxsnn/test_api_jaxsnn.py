@@ -320,7 +320,7 @@ CASES = [
         lambda rng: f32(rng.uniform(0, 90, 2)),
     ),
     Case(
-        "network.init",
+        "network_state.init",
         lambda k: network.init(k, SMALL, CONSTANTS),
         lambda rng: (key(rng),),
         (),
@@ -345,12 +345,12 @@ CASES = [
         (0,),
     ),
     Case(
-        "network.reset_membranes",
+        "network_state.reset_membranes",
         lambda s, fresh: network.reset_membranes(CONSTANTS, s, fresh),
         lambda rng: (brain(rng), np.bool_(rng.random() < 0.5)),
     ),
     Case(
-        "network.reinforce",
+        "reinforcement.reinforce",
         lambda w, e, r: network.reinforce(SMALL, CONSTANTS, w, e, r),
         lambda rng: (brain(rng).weights, held(rng), *f32(rng.normal(size=2))),
         (0, 2),

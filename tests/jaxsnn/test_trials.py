@@ -101,6 +101,7 @@ def test_statuses_steps_and_paths(phase):
     assert (straight.status == Status.COLLIDED).any()
 
 
+@pytest.mark.slow
 def test_results_do_not_depend_on_the_block(phase):
     args = {"name": "seek", "n_trials": 2, "max_steps": 40, "record": False}
     _, three = phase(None, PLACE, jnp.zeros((3, 2), jnp.int32), keys(3), **args)
@@ -109,6 +110,7 @@ def test_results_do_not_depend_on_the_block(phase):
     np.testing.assert_allclose(three.path[1], one.path[0], rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_a_phase_in_two_parts_is_the_phase_in_one(phase):
     args = {"name": "seek", "max_steps": 40, "record": False}
     states = jnp.zeros((3, 2), jnp.int32)
@@ -170,6 +172,7 @@ def test_experiment_learns_then_freezes():
     np.testing.assert_allclose(still.states.weights.hidden, start, rtol=1e-6)
 
 
+@pytest.mark.slow
 def test_nan_weights_stop_one_robot_only():
     learner, params = snn_agent(SMALL), snn_params(SMALL, PARAMS)
     states = jax.jit(jax.vmap(lambda k: learner.init(k, params)))(keys(2))

@@ -100,6 +100,7 @@ def run(config, params, **options):
               options.get("states"))  # fmt: skip
 
 
+@pytest.mark.slow
 def test_turns_are_cut_off_the_rate_anneals_and_networks_go_on(tmp_path):
     config, params = small(input_code="interval", turn_groups=True, guidance="graded")
     params = params._replace(max_turn=20.0, gamma=1e-3)
@@ -130,6 +131,7 @@ def test_turns_are_cut_off_the_rate_anneals_and_networks_go_on(tmp_path):
         save_networks(tmp_path / "nets.pkl", config, first.states)
 
 
+@pytest.mark.slow
 def test_a_reward_of_one_s_own_takes_the_place_of_the_built_in_one():
     graded, params = small(guidance="graded")
     nearest, _ = small()

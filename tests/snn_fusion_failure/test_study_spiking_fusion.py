@@ -46,6 +46,8 @@ def test_single_runs_become_rows_and_paired_tests(tmp_path: Path) -> None:
     assert unseen["row"] == "unseen kinds" and seen["p_holm"] == pytest.approx(2 * seen["p_value"])
 
 
+# optax raises a float to a whole power, which strict promotion forbids.
+@pytest.mark.relaxed
 @pytest.mark.slow
 def test_a_column_trains_and_tells_its_cost(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch

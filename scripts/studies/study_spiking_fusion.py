@@ -9,7 +9,7 @@ under failures that no training had. Columns: the convolutional networks of reco
 small as the spiking ones, the spiking networks, spiking encoders that stay as drawn with a linear
 head (the trivial opponent), synapses that learn by reward-modulated STDP, and the gate that is told
 which sensors failed. Each training is kept as it comes in `runs/study_spiking_fusion`, so the same
-command goes on after an interruption, and the table is written again after each seed. With
+command goes on after an interruption, and the table is written again after each of them. With
 `--validation` it scores on held-out subjects and writes nothing to `results/`.
 """
 
@@ -239,17 +239,14 @@ def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
     return rows, pairs
 
 
-def write(config: Config) -> list[dict[str, Any]]:
-    """Put the table and its comparisons where they belong; returns the comparisons."""
+def write(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Put the table and its comparisons where they belong; returns both."""
     rows, pairs = collect(config)
     if rows and not config.validation:
         record_table(config.results / f"{NAME}.json", NAME, TITLE, rows, preset=config.preset)
         path = config.results / f"{NAME}.json"
         write_json(path, json.loads(path.read_text(encoding="utf-8")) | {"comparisons": pairs})
-    for row in rows:
-        if row["metric"] == "accuracy":
-            print(f"{row['row']:26} {row['model']:22} {row['mean']:6.2f} % of {row['n']} seeds")
-    return pairs
+    return rows, pairs
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -270,8 +267,12 @@ def main(config: Config) -> dict[str, Any]:
                 bar.update(task, status=f"{run.row} {run.model} s{run.seed}")
                 found = execute(config, run, loaded[ROWS[run.row]["dataset"]])
                 write_json(run.path(config), found)
+                write(config)
                 bar.advance(task)
-    pairs = write(config)
+    rows, pairs = write(config)
+    for row in rows:
+        if row["metric"] == "accuracy":
+            print(f"{row['row']:26} {row['model']:22} {row['mean']:6.2f} % of {row['n']} seeds")
     print_result(study=NAME, runs=len(todo), comparisons=len(pairs))
     return {"comparisons": pairs}
 

@@ -103,7 +103,9 @@ ENCODED: dict[str, tuple[str, str]] = {
 # docs/spiking_fusion.md. Gains that vary in training stand for the gaits of other people.
 _SPIKING: dict[str, tuple[SpikingConfig, dict[str, Any], dict[str, Any]]] = {
     "har": (
-        SpikingConfig(widths=(16, 32), taps=(8, 12), strides=(4, 2), threshold=0.7),
+        SpikingConfig(
+            code="contrast", widths=(16, 32), taps=(8, 12), strides=(4, 2), threshold=0.7
+        ),
         {"head_widths": (64,), "gate_width": 32},
         {"epochs": 15, "jitter": 0.3},
     ),

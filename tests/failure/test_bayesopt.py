@@ -41,6 +41,7 @@ def full_run():
     return runs.run(config(), bowl)
 
 
+@pytest.mark.slow
 def test_search_finds_the_maximum_that_random_sampling_misses(full_run):
     random = runs.run(config("monte_carlo"), bowl)
     assert full_run.y.shape == (2, 24)

@@ -97,6 +97,7 @@ def test_an_absent_sensor_is_never_read(model: str) -> None:
     assert not slope[0, 1].any() and slope[0, 0].any()
 
 
+@pytest.mark.slow
 def test_raw_windows_give_probabilities_and_weights(fitted: FittedARGate) -> None:
     found = fitted.predict(RAW, channels=CHANNELS)
     assert found.probabilities.argmax(1).tolist() == [1, 0, 1]

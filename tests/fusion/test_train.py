@@ -69,6 +69,7 @@ def trained() -> object:
     return fit(MODEL, TRAIN, HYPER, DATA, NOISE, key=jax.random.key(0))
 
 
+@pytest.mark.slow
 def test_learns_to_find_the_one_healthy_sensor(trained: object) -> None:
     output = test_output(MODEL, trained.state, DATA, NOISE, key=jax.random.key(0))
     parts = split_accuracy(output.labels, output.logits.argmax(-1), output.failed)

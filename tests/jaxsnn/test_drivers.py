@@ -31,6 +31,7 @@ def test_steering_by_rule(name, sonar, angle, steering):
     assert float(driver_steering(DRIVERS[name], reading(sonar, angle))) == steering
 
 
+@pytest.mark.slow
 def test_drivers_side_by_side_are_one_by_one():
     """A sweep over a driver's constants is a vmap."""
     keys = jax.random.split(jax.random.key(0), 4)

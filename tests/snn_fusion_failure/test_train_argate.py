@@ -37,6 +37,7 @@ def run(tmp_path_factory: pytest.TempPathFactory) -> tuple[Config, dict[str, Any
         return config, train_argate.main(config)
 
 
+@pytest.mark.slow
 def test_a_run_leaves_numbers_and_pictures(
     run: tuple[Config, dict[str, Any]], capsys: pytest.CaptureFixture[str]
 ) -> None:

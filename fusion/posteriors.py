@@ -12,11 +12,18 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from fusion._checks import check_count, check_key, check_number
+from fusion._checks import check_count, check_number
 from fusion.config import MODELS, ModelConfig
 from fusion.gating import normalize
 from fusion.models import Params, predict
-from fusion.uncertainty import DRAWS, Predictive, summarize_draws
+from fusion.uncertainty import (
+    DRAWS,
+    Predictive,
+    draw_keys,
+    mix_gates,
+    push_scores,
+    summarize_draws,
+)
 
 
 def ensemble_predictive(
@@ -60,14 +67,12 @@ def dropout_predictive(
 
     Source: Gal and Ghahramani (2016).
     """
-    check_key(key)
-    check_count("n_draws", n_draws)
+    keys = draw_keys(n_draws, key=key)
     if config.dropout == 0.0:
         raise ValueError(
             "dropout=0.0: expected a rate above 0; a network that was trained without dropout has "
             "nothing to draw"
         )
-    keys = jax.random.split(key, n_draws)
     out = jax.vmap(lambda one: predict(config, main, x, key=one))(keys)
     return summarize_draws(out.logits, out.weights, level)
 
@@ -120,10 +125,9 @@ def gate_curvature(
         given = normalize(scores, config.normalizer)
         return predict(config, main, x, weights=given).logits
 
-    logits, push = jax.linearize(head, _scores(main, features, inputs))
-    unit = jnp.eye(config.n_sensors, dtype=x.dtype)
-    tangents = jnp.broadcast_to(unit[:, None, :], (config.n_sensors, *x.shape[:2]))
-    slopes = jax.vmap(push)(tangents)
+    scores = _scores(main, features, inputs)
+    logits, push = jax.linearize(head, scores)
+    slopes = push_scores(push, scores)
     p = jax.nn.softmax(logits, axis=-1)
     mean = jnp.einsum("kbc,bc->kb", slopes, p)
     inner = jnp.einsum("kbc,bc,lbc->bkl", slopes, p, slopes) - jnp.einsum("kb,lb->bkl", mean, mean)
@@ -195,18 +199,15 @@ def laplace_predictive(
     Raises:
         ValueError: a legacy key, a level outside (0, 1).
     """
-    check_key(key)
-    check_count("n_draws", n_draws)
+    keys = draw_keys(n_draws, key=key)
     features = predict(config, main, x, available=available).features
     mean, covariance = laplace_moments(main, laplace, features)
     values, vectors = jnp.linalg.eigh(covariance)
     root = vectors * jnp.sqrt(jnp.maximum(values, 0.0))[:, None, :]
 
-    def draw(one: Key[Array, ""]) -> tuple[Array, Array]:
+    def weights_of(one: Key[Array, ""]) -> Array:
         noise = jax.random.normal(one, mean.shape, mean.dtype)
         scores = mean + jnp.einsum("bkj,bj->bk", root, noise)
-        given = normalize(scores, config.normalizer)
-        out = predict(config, main, x, available=available, weights=given)
-        return out.logits, out.weights
+        return normalize(scores, config.normalizer)
 
-    return summarize_draws(*jax.vmap(draw)(jax.random.split(key, n_draws)), level)
+    return mix_gates(config, main, x, available, weights_of, keys, level)

@@ -6,6 +6,7 @@ approximation by means and variances that one pass carries along (`one_pass_pred
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -150,9 +151,7 @@ def scores_predictive(
         return out.logits, out.weights
 
     (logits, used), push = jax.linearize(head, jnp.log(jnp.maximum(weights, 1e-12)))
-    unit = jnp.eye(config.n_sensors, dtype=mean.dtype)
-    tangents = jnp.broadcast_to(unit[:, None, :], (config.n_sensors, *mean.shape))
-    slopes, _ = jax.vmap(push)(tangents)
+    slopes, _ = push_scores(push, mean)
     spread = jnp.einsum("kbc,bkl,lbd->bcd", slopes, covariance, slopes)
     probabilities = expected_softmax(logits, _pairs(spread))
     p = jax.nn.softmax(logits, axis=-1)
@@ -179,6 +178,42 @@ def _odds_interval(mean: Array, covariance: Array, level: float) -> tuple[Array,
     sd = jnp.sqrt(jnp.maximum(jnp.einsum("bkj,bjl,bkl->bk", slope, covariance, slope), 0.0))
     z = jax.scipy.stats.norm.ppf(0.5 + level / 2.0).astype(mean.dtype)
     return jax.nn.sigmoid(odds - z * sd), jax.nn.sigmoid(odds + z * sd)
+
+
+def draw_keys(n_draws: int, *, key: Key[Array, ""]) -> Key[Array, " s"]:
+    """A key for each draw.
+
+    Raises:
+        ValueError, TypeError: a legacy key, or no draw.
+    """
+    check_key(key)
+    check_count("n_draws", n_draws)
+    return jax.random.split(key, n_draws)
+
+
+def mix_gates(
+    config: ModelConfig,
+    main: Params,
+    x: Float[Array, "b k t"],
+    available: Bool[Array, "b k"] | None,
+    weights_of: Callable[[Key[Array, ""]], Float[Array, "b k"]],
+    keys: Key[Array, " s"],
+    level: float,
+) -> Predictive:
+    """The mixture over draws of the fusion weights: `weights_of(key)` is one of them."""
+
+    def draw(one: Key[Array, ""]) -> tuple[Array, Array]:
+        out = predict(config, main, x, available=available, weights=weights_of(one))
+        return out.logits, out.weights
+
+    return summarize_draws(*jax.vmap(draw)(keys), level)
+
+
+def push_scores(push: Callable[..., Any], scores: Float[Array, "b k"]) -> Any:
+    """What `push`, linear in the scores of `jax.linearize`, gives for a unit of each of the K."""
+    k = scores.shape[-1]
+    unit = jnp.eye(k, dtype=scores.dtype)
+    return jax.vmap(push)(jnp.broadcast_to(unit[:, None, :], (k, *scores.shape)))
 
 
 def _check_variational(config: ModelConfig) -> None:
@@ -224,17 +259,14 @@ def sample_predictive(
         ((5, 3), True)
     """
     _check_variational(config)
-    check_key(key)
-    check_count("n_draws", n_draws)
+    keys = draw_keys(n_draws, key=key)
     features = predict(config, main, x, available=available).features
     gate = variational_gate(config)
 
-    def draw(one: Key[Array, ""]) -> tuple[Array, Array]:
-        given: Any = gate.apply({"params": main["gate"]}, features, one)
-        out = predict(config, main, x, available=available, weights=given)
-        return out.logits, out.weights
+    def weights_of(one: Key[Array, ""]) -> Any:
+        return gate.apply({"params": main["gate"]}, features, one)
 
-    return summarize_draws(*jax.vmap(draw)(jax.random.split(key, n_draws)), level)
+    return mix_gates(config, main, x, available, weights_of, keys, level)
 
 
 def one_pass_predictive(

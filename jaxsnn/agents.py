@@ -18,7 +18,7 @@ from jaxsnn.config import NetworkConfig, NetworkParams, check_network
 from jaxsnn.encoding import RateTable, group_rates, interval_rates, poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
 from jaxsnn.rewards import motor_rewards, scale_by_remaining_turn, terminal_reward
-from jaxsnn.turn_goal import turn_reward
+from jaxsnn.turn_goal import turn_reward, update_recent_turn
 from jaxsnn.window import STDPKernel
 from jaxsnn.world import Outcome, Reading
 
@@ -223,8 +223,7 @@ def snn_agent(
         firing = (total + count(spikes)) / (config.control_steps * config.dt)
         limit = constants.max_turn
         steering = jnp.clip(steering_angle(constants, firing[:2]), -limit, limit)
-        kept = constants.goal.memory
-        turned = kept * recent_turn + (1.0 - kept) * jnp.clip(steering, -60.0, 60.0)
+        turned = update_recent_turn(constants.goal, recent_turn, steering)
         state = state._replace(recent_turn=turned.astype(state.recent_turn.dtype))
         return state, steering, SNNMemory(eligibility, reading, recent_turn), firing
 

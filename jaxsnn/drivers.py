@@ -8,6 +8,7 @@ says nothing about learning to avoid obstacles.
 from __future__ import annotations
 
 import functools
+from collections.abc import Callable
 from typing import Any, NamedTuple
 
 import jax
@@ -73,12 +74,34 @@ def driver_agent() -> Agent:
     ) -> tuple[Any, Float[Array, ""], None, Float[Array, "0"]]:
         return state, driver_steering(params, reading), None, jnp.zeros((0,))
 
+    return fixed_agent(act)
+
+
+def fixed_agent(act: Callable[..., Any]) -> Agent:
+    """An agent that learns nothing; its state is one number, which `act` may use."""
     return Agent(
         init=lambda key, params: jnp.zeros(()),
         act=act,
         learn=lambda params, state, memory, outcome, next_reading, active: state,
         finite=jnp.isfinite,
     )
+
+
+def drive_fixed(
+    agent: Agent,
+    params: Any,
+    map: world.WorldParams,
+    *,
+    keys: Key[Array, " robots"],
+    n_trials: int,
+    max_steps: int,
+) -> TrialResult:
+    """Drive robots by an agent of `fixed_agent` over a map: TrialResult, `[robots, trials]`."""
+    states = jnp.zeros(keys.shape[0])
+    _, result = run_phase(
+        agent, params, map, states, keys=keys, n_trials=n_trials, max_steps=max_steps
+    )
+    return result
 
 
 @functools.partial(jax.jit, static_argnames=("n_trials", "max_steps"))
@@ -101,8 +124,6 @@ def drive(
         >>> success_rate(drive(DRIVERS["blind"], scenario(1), keys=keys)).tolist()
         [1.0, 1.0, 1.0, 1.0]
     """
-    states = jnp.zeros(keys.shape[0])
-    _, result = run_phase(
-        driver_agent(), params, map, states, keys=keys, n_trials=n_trials, max_steps=max_steps
+    return drive_fixed(
+        driver_agent(), params, map, keys=keys, n_trials=n_trials, max_steps=max_steps
     )
-    return result

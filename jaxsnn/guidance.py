@@ -15,17 +15,17 @@ from jaxtyping import Array, Bool, Float, Key
 
 from jaxsnn import world
 from jaxsnn.agents import Agent
-from jaxsnn.trials import TrialResult, run_phase
-from jaxsnn.turn_goal import TurnGoalParams, turn_goal
+from jaxsnn.drivers import drive_fixed, fixed_agent
+from jaxsnn.trials import TrialResult
+from jaxsnn.turn_goal import TurnGoalParams, turn_goal, update_recent_turn
 
 
 def guidance_agent() -> Agent:
     r"""A driver that turns as the graded reward asks; its state is the leaky mean of its turns.
 
-    .. math:: \theta = g(\text{reading}, \bar\theta), \qquad
-        \bar\theta \leftarrow m \bar\theta + (1 - m)\,\mathrm{clip}(\theta, -60, 60)
+    .. math:: \theta = g(\text{reading}, \bar\theta)
 
-    with :math:`g` of `turn_goal` and :math:`m` its `memory`.
+    with :math:`g` of `turn_goal` and :math:`\bar\theta` of `turn_goal.update_recent_turn`.
 
     Returns:
         Agent whose parameters are TurnGoalParams.
@@ -42,15 +42,10 @@ def guidance_agent() -> Agent:
     ) -> tuple[Float[Array, ""], Float[Array, ""], None, Float[Array, "0"]]:
         recent = jnp.where(fresh, jnp.zeros_like(state), state)
         turn, _ = turn_goal(params, reading, recent)
-        kept = params.memory * recent + (1.0 - params.memory) * jnp.clip(turn, -60.0, 60.0)
+        kept = update_recent_turn(params, recent, turn)
         return kept.astype(state.dtype), turn, None, jnp.zeros((0,))
 
-    return Agent(
-        init=lambda key, params: jnp.zeros(()),
-        act=act,
-        learn=lambda params, state, memory, outcome, next_reading, active: state,
-        finite=jnp.isfinite,
-    )
+    return fixed_agent(act)
 
 
 @functools.partial(jax.jit, static_argnames=("n_trials", "max_steps"))
@@ -74,8 +69,6 @@ def drive_guided(
         >>> success_rate(drive_guided(rule, scenario(1), keys=keys, n_trials=2)).tolist()
         [1.0, 1.0]
     """
-    states = jnp.zeros(keys.shape[0])
-    _, result = run_phase(
-        guidance_agent(), params, map, states, keys=keys, n_trials=n_trials, max_steps=max_steps
+    return drive_fixed(
+        guidance_agent(), params, map, keys=keys, n_trials=n_trials, max_steps=max_steps
     )
-    return result

@@ -97,6 +97,18 @@ def turn_goal(
     )
 
 
+def update_recent_turn(
+    params: TurnGoalParams, recent: Float[Array, ""], turn: Float[Array, ""]
+) -> Float[Array, ""]:
+    r"""The leaky mean of the turns after one more [deg].
+
+    .. math:: \bar\theta \leftarrow m \bar\theta + (1 - m)\,\mathrm{clip}(\theta, -60, 60)
+
+    with :math:`m` the `memory`.
+    """
+    return params.memory * recent + (1.0 - params.memory) * jnp.clip(turn, -60.0, 60.0)
+
+
 def turn_reward(
     params: TurnGoalParams,
     reading: Reading,

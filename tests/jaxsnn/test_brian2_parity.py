@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -16,6 +13,7 @@ import pytest
 from jaxsnn import network
 from jaxsnn.config import NetworkConfig, Weights, network_params, neuron_signs
 from jaxsnn.plasticity import STDPParams
+from tests._recordings import assert_recording_is_made_again
 
 REFERENCE = Path(__file__).resolve().parent.parent / "reference" / "snn_brian2.py"
 
@@ -85,17 +83,5 @@ def test_brian2_parity(recipe, golden, rule, dtype):
 @pytest.mark.slow
 def test_recording_can_be_made_again(golden, tmp_path):
     """With an interpreter that has Brian 2, the recording script gives the recorded numbers."""
-    # Brian 2.9 needs an older NumPy than ours, so an environment of its own.
-    python = os.environ.get("BRIAN2_PYTHON", sys.executable)
-    has = subprocess.run([python, "-c", "import brian2"], capture_output=True, check=False)
-    if has.returncode:
-        pytest.skip("no Brian 2: set BRIAN2_PYTHON to an interpreter that can import it")
-    code = (
-        "import importlib.util as u, pathlib, sys\n"
-        f"s = u.spec_from_file_location('r', r'{REFERENCE}'); m = u.module_from_spec(s)\n"
-        f"s.loader.exec_module(m); m.GOLDEN = pathlib.Path(r'{tmp_path}') / 'new.npz'; m.main()\n"
-    )
-    subprocess.run([python, "-c", code], check=True)
-    old, new = np.load(golden / "snn_brian2.npz"), np.load(tmp_path / "new.npz")
-    for name in set(old) - {"versions"}:
-        np.testing.assert_allclose(new[name], old[name], rtol=1e-6, atol=1e-6)
+    recorded = golden / "snn_brian2.npz"
+    assert_recording_is_made_again(REFERENCE, recorded, tmp_path, tolerance=1e-6)

@@ -3,9 +3,6 @@
 from __future__ import annotations
 
 import importlib.util
-import os
-import subprocess
-import sys
 from pathlib import Path
 
 import jax
@@ -14,6 +11,7 @@ import numpy as np
 import pytest
 
 from jaxsnn import declared as d
+from tests._recordings import assert_recording_is_made_again
 
 REFERENCE = Path(__file__).resolve().parent.parent / "reference" / "snn_models_brian2.py"
 TIGHT = 1e-11
@@ -244,17 +242,5 @@ def test_in_single_precision_potentials_stay_near_brian2(recipe, data) -> None:
 @pytest.mark.slow
 def test_the_recording_can_be_made_again(golden, tmp_path) -> None:
     """With an interpreter that has Brian 2, the script gives the recorded numbers."""
-    python = os.environ.get("BRIAN2_PYTHON", sys.executable)
-    has = subprocess.run([python, "-c", "import brian2"], capture_output=True, check=False)
-    if has.returncode:
-        pytest.skip("no Brian 2: set BRIAN2_PYTHON to an interpreter that can import it")
-    code = (
-        "import importlib.util as u, pathlib\n"
-        f"s = u.spec_from_file_location('r', r'{REFERENCE}'); m = u.module_from_spec(s)\n"
-        f"s.loader.exec_module(m); m.GOLDEN = pathlib.Path(r'{tmp_path}') / 'new.npz'; m.main()\n"
-    )
-    subprocess.run([python, "-c", code], check=True)
-    old = np.load(golden / "snn_models_brian2.npz")
-    new = np.load(tmp_path / "new.npz")
-    for name in set(old) - {"versions"}:
-        np.testing.assert_allclose(new[name], old[name], rtol=1e-9, atol=1e-9)
+    recorded = golden / "snn_models_brian2.npz"
+    assert_recording_is_made_again(REFERENCE, recorded, tmp_path, tolerance=1e-9)

@@ -20,7 +20,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.rows import compare_columns, record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -213,8 +213,6 @@ def load_runs(config: Config) -> dict[tuple[str, str], dict[int, dict[str, Any]]
 
 def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows in the schema of record, and paired comparisons of accuracy (Holm over all of them)."""
-    from snn_fusion_failure.records.statistics import holm, paired_test
-
     held = load_runs(config)
     rows = []
     for (row, model), by_seed in held.items():
@@ -225,27 +223,21 @@ def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
                 continue
             cell = {"row": row, "model": model, "metric": metric, "unit": unit}
             rows.append(cell | summarize(values))
-    pairs = []
-    for row in dict.fromkeys(name for name, _ in held):
-        for better, worse in PAIRS:
-            a, b = held.get((row, better), {}), held.get((row, worse), {})
-            if len(common := sorted(set(a) & set(b))) < 2:
-                continue
-            one, other = ([t[s]["accuracy"] for s in common] for t in (a, b))
-            found = paired_test(one, other)._asdict()
-            pairs.append({"row": row, "comparison": f"{better} - {worse}", **found})
-    for pair, p in zip(pairs, holm([pair["p_value"] for pair in pairs]), strict=True):
-        pair["p_holm"] = p
-    return rows, pairs
+    return rows, compare_columns(held, PAIRS)
 
 
 def write(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Put the table and its comparisons where they belong; returns both."""
     rows, pairs = collect(config)
     if rows and not config.validation:
-        record_table(config.results / f"{NAME}.json", NAME, TITLE, rows, preset=config.preset)
-        path = config.results / f"{NAME}.json"
-        write_json(path, json.loads(path.read_text(encoding="utf-8")) | {"comparisons": pairs})
+        record_table(
+            config.results / f"{NAME}.json",
+            NAME,
+            TITLE,
+            rows,
+            preset=config.preset,
+            comparisons=pairs,
+        )
     return rows, pairs
 
 

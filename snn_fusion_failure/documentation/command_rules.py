@@ -102,7 +102,7 @@ RULES = (
             "--preset quick --seeds 1 --models argate_plus --rows 'n_clean=8 uniform' "
             "--results runs",
         )
-        for study in ("driver_heads", "driver_tagged")
+        for study in ("driver_heads", "driver_tagged", "driver_trip")
     ),
     Rule(
         "study_sensors.py",

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import json
-from collections.abc import Iterable, Sequence
+from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +24,34 @@ def summarize(values: Sequence[float]) -> dict[str, Any]:
     return {"n": len(values), "mean": found.mean, "ci95": [found.low, found.high], "values": values}
 
 
+def compare_columns(
+    held: Mapping[tuple[str, str], Mapping[int, Mapping[str, Any]]],
+    pairs: Iterable[tuple[str, str]],
+    metric: str = "accuracy",
+) -> list[dict[str, Any]]:
+    """Differences between columns seed by seed, with Holm's correction over all of them.
+
+    Args:
+        held: (row, column) -> seed -> scores.
+        pairs: (column, column that is taken from it); pairs of fewer than two common seeds are
+            left out.
+        metric: the score that is compared.
+    """
+    from snn_fusion_failure.records.statistics import holm, paired_test
+
+    chosen, found = list(pairs), []
+    for row in dict.fromkeys(name for name, _ in held):
+        for one, other in chosen:
+            a, b = held.get((row, one), {}), held.get((row, other), {})
+            if len(common := sorted(set(a) & set(b))) < 2:
+                continue
+            test = paired_test(*([t[s][metric] for s in common] for t in (a, b)))
+            found.append({"row": row, "comparison": f"{one} - {other}", **test._asdict()})
+    for test, p in zip(found, holm([test["p_value"] for test in found]), strict=True):
+        test["p_holm"] = p
+    return found
+
+
 def recorded(path: Path) -> list[dict[str, Any]]:
     """Rows of a table of record; none where it has not been written."""
     if not path.exists():
@@ -33,11 +61,18 @@ def recorded(path: Path) -> list[dict[str, Any]]:
 
 
 def record_table(
-    path: Path, table: str, title: str, rows: Iterable[dict[str, Any]], *, preset: str
+    path: Path,
+    table: str,
+    title: str,
+    rows: Iterable[dict[str, Any]],
+    *,
+    preset: str,
+    comparisons: list[dict[str, Any]] | None = None,
 ) -> None:
     """Write or update a table of record; rows are replaced by (row, model, metric), others stay.
 
-    Every row keeps the command and the commit that made it; the interval of a share is one that
+    Every row keeps the command and the commit that made it, and `comparisons` are those of
+    `compare_columns`; the interval of a share is one that
     stays within 0 and 100 %. Numbers of code that was changed and not committed are refused in
     `results/`, and kept under `runs/refused/` instead, unless `SFF_ALLOW_DIRTY=1` is set; their
     `git` field ends in `-dirty`.
@@ -61,10 +96,8 @@ def record_table(
 
     new = {key(row) for row in rows}
     kept = [row for row in recorded(path) if key(row) not in new]
-    write_json(
-        path,
-        {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows},
-    )
+    held = {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows}
+    write_json(path, held | ({"comparisons": comparisons} if comparisons else {}))
 
 
 def _ends(row: dict[str, Any]) -> dict[str, Any]:

@@ -11,7 +11,7 @@ from fusion.gating import Normalizer
 from fusion.losses import LossConfig
 from fusion.targets import TargetConfig
 
-DetectorModel = Literal["avod", "avod_argate", "dense", "dense_argate"]
+DetectorModel = Literal["avod", "avod_argate", "dense", "dense_argate", "dense_oracle"]
 DETECTORS: tuple[str, ...] = get_args(DetectorModel)
 
 # k-means of the 14,357 labelled cars of the usual training list: length, width, height [m].
@@ -64,9 +64,12 @@ class DetectorConfig:
 
     Attributes:
         model: `avod` (mean fusion) or `avod_argate` (fusion weights), in two stages; `dense` or
-            `dense_argate`, in one stage on a grid over the ground.
-        dense: sizes of the latter two, which share with AVOD what is about area, image, labels,
+            `dense_argate`, in one stage on a grid over the ground; `dense_oracle`, whose gate is
+            told which sensor fails and how severely.
+        dense: sizes of the latter three, which share with AVOD what is about area, image, labels,
             gate and paths.
+        fixed_weights: of (camera, lidar), in place of the network's; `dense` models only. (1, 0)
+            leaves a detector of the camera alone.
         bev, anchors: area and anchor grid.
         image_size: rows and columns that images are resized to.
         max_points, max_objects: fixed sizes of scan and labels.
@@ -141,6 +144,7 @@ class DetectorConfig:
     )
     auxiliary_second: bool = True
     balanced_paths: bool = True
+    fixed_weights: tuple[float, float] | None = None
 
     def __post_init__(self) -> None:
         """Refuse what cannot be built."""
@@ -174,6 +178,11 @@ class DetectorConfig:
                 f"cell={self.dense.cell}: expected a multiple of the map's {self.bev.cell} m that "
                 f"divides its {self.bev.shape[0]} x {self.bev.shape[1]} cells"
             )
+        if self.fixed_weights is not None and not self.is_dense:
+            raise ValueError(
+                f"fixed_weights={self.fixed_weights}: expected none with model={self.model!r}; the "
+                "dense models can do without a sensor"
+            )
         for name in ("dropout", "path_drop"):
             if not 0 <= getattr(self, name) < 1:
                 raise ValueError(f"{name}={getattr(self, name)}: expected a share in [0, 1)")
@@ -182,6 +191,16 @@ class DetectorConfig:
     def gated(self) -> bool:
         """Has the model a gate, auxiliary paths and targets?"""
         return self.model.endswith("_argate")
+
+    @property
+    def is_oracle(self) -> bool:
+        """Is its gate told which sensor fails?"""
+        return self.model == "dense_oracle"
+
+    @property
+    def weighs(self) -> bool:
+        """Do its fusion weights depend on the frame?"""
+        return self.gated or self.is_oracle
 
     @property
     def is_dense(self) -> bool:

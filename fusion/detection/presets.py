@@ -98,7 +98,7 @@ def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
         size: `paper`, AVOD's sizes and rates; `small`, 0.25 m cells over 44 x 44 m, images at a
             quarter of the side and a quarter of the width, 2,000 steps, for two CPU cores; `tiny`,
             for tests.
-        model: `avod`, `avod_argate`, `dense` or `dense_argate`.
+        model: one of `DETECTORS`.
 
     Returns:
         DetectorSetup: config, train, params.
@@ -115,7 +115,7 @@ def preset(size: str, model: str = "avod_argate") -> DetectorSetup:
         raise ValueError(f"model={model!r}: expected one of {', '.join(DETECTORS)}")
     named = cast(DetectorModel, model)
     if model.startswith("dense"):
-        twin = preset(size, model.replace("dense", "avod"))
+        twin = preset(size, "avod" if model == "dense" else "avod_argate")
         made = twin._replace(config=dataclasses.replace(twin.config, model=named))
         return _dense(size, made)
     base = DetectorConfig(model=named)

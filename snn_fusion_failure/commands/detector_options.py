@@ -8,7 +8,7 @@ from typing import Annotated, Literal
 
 import tyro
 
-Model = Literal["avod", "avod_argate", "dense", "dense_argate"]
+Model = Literal["avod", "avod_argate", "dense", "dense_argate", "dense_oracle"]
 Size = Literal["paper", "small", "tiny"]
 ModelOption = Annotated[Model, tyro.conf.arg(aliases=["--config"])]
 SizeOption = Annotated[Size, tyro.conf.arg(aliases=["--preset"])]

@@ -98,7 +98,7 @@ def resolved(setup: Any) -> dict[str, Any]:
     numbers = setup.params._asdict()
     detector["gate_params"] = numbers.pop("gate")._asdict()
     training |= numbers
-    if not setup.config.gated:
+    if not setup.config.weighs:
         # What only the gate reads may differ.
         of_gate = ("gate", "targets", "auxiliary", "balanced", "normalizer")
         detector = {k: v for k, v in detector.items() if not k.startswith(of_gate)}

@@ -136,6 +136,11 @@ RULES = (
         "--size tiny --seeds 1 --steps 1 --kinds camera_blackout --any-size",
     ),
     Rule(
+        "study_robustness.py",
+        "--size tiny --seeds 1 --steps 1 --models dense --kinds camera_blackout lidar_loss "
+        "--levels 5 --any-size --results runs",
+    ),
+    Rule(
         "study_views.py",
         "--data runs/kitti --kinds camera_blackout --runs "
         "runs/detector/kitti_avod_argate_tiny_failures_s0",
@@ -229,6 +234,7 @@ PLACEHOLDERS = {
 AREAS = {
     "detector": (
         "simulate_kitti", "train_detector", "evaluate_kitti", "study_detector", "study_geometry",
+        "study_robustness",
         "study_views", "study_anchors",
         "draw_detections", "bench_detector", "bench_kitti_eval",
     ),

@@ -17,8 +17,9 @@ from fusion.detection.learning.dense_targets import GridTargets, decode_cells, g
 from fusion.detection.learning.examples import make_example
 from fusion.detection.learning.fitting import fit_detector, run_detector
 from fusion.detection.learning.params import DetectorParams
-from fusion.detection.learning.training import DetectorTrainConfig
-from fusion.detection.network.build import count_main_parameters
+from fusion.detection.learning.training import DetectorTrainConfig, fail_sensor
+from fusion.detection.network.build import count_main_parameters, init_detector
+from fusion.detection.network.dense import DenseDetector
 from fusion.detection.network.lifting import grid_centres, lift
 from fusion.detection.presets import preset
 from fusion.targets import check_targets
@@ -89,10 +90,35 @@ def test_losses_by_hand() -> None:
 
 def test_the_gate_adds_less_than_two_percent() -> None:
     for size in ("paper", "small"):
-        plain, gated = (
-            count_main_parameters(preset(size, m).config) for m in ("dense", "dense_argate")
+        plain, gated, oracle = (
+            count_main_parameters(preset(size, m).config)
+            for m in ("dense", "dense_argate", "dense_oracle")
         )
-        assert plain < gated < 1.02 * plain
+        assert plain < gated < 1.02 * plain and plain < oracle < 1.02 * plain
+
+
+@pytest.mark.slow
+def test_only_the_oracle_is_told() -> None:
+    example, _ = make_example(TINY, a_frame())
+    fail = jax.jit(lambda key: fail_sensor(TINY, example, "lidar_noise", 0.5, key=key))
+    failing = jax.tree.map(lambda a: a[None], fail(jax.random.key(1)))
+    np.testing.assert_array_equal(failing.told, [[0.0, 0.5]])
+    works = failing._replace(told=jnp.zeros((1, 2)))
+    for model in ("dense_argate", "dense_oracle"):
+        config = dataclasses.replace(TINY, model=model)
+        params, _ = jax.jit(partial(init_detector, config=config))(jax.random.key(0))
+        gate = params["main"]["gate"]["fusion"]
+        gate["kernel"] = jax.random.normal(jax.random.key(2), gate["kernel"].shape)
+        weigh = jax.jit(partial(DenseDetector(config).apply, method="encode"))
+        weights = [weigh({"params": params["main"]}, x).weights for x in (works, failing)]
+        np.testing.assert_allclose(weights[0].sum(), 1.0, rtol=1e-5)
+        assert np.array_equal(*weights) == (model == "dense_argate")
+    fixed = dataclasses.replace(config, fixed_weights=(1.0, 0.0))
+    weigh = jax.jit(partial(DenseDetector(fixed).apply, method="encode"))
+    alone = weigh({"params": params["main"]}, works)
+    np.testing.assert_array_equal(alone.weights, [[1.0, 0.0]])
+    with pytest.raises(ValueError, match="expected none with model='avod'"):
+        dataclasses.replace(TINY, model="avod", fixed_weights=(1.0, 0.0))
 
 
 @pytest.mark.relaxed

@@ -15,7 +15,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
-from fusion.detection.geometry.anchors import anchor_grid, select_anchors
+from fusion.detection.geometry.anchors import Anchors, anchor_grid, select_anchors
 from fusion.detection.geometry.bev import bev_maps
 from fusion.detection.geometry.planes import PlaneConfig, fit_plane, height_above
 from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
@@ -213,6 +213,7 @@ def make_inputs(
     mirror: Bool[Array, ""] | None = None,
     key: PRNGKeyArray | None = None,
     colour_sd: float = 0.0,
+    told: Float[Array, "2"] | None = None,
 ) -> Inputs:
     """Maps and anchors of one frame, inside jit.
 
@@ -223,6 +224,7 @@ def make_inputs(
             image in [0, 1].
         mirror: flip the frame.
         key, colour_sd: shift of the colour channels in training, standard deviation in [0, 1].
+        told: severity of the failure of (camera, lidar), for the oracle; zeros when left out.
     """
     if image is None:
         image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
@@ -241,8 +243,12 @@ def make_inputs(
     if key is not None and colour_sd > 0:
         image = image + colour_sd * jax.random.normal(key, (1, 1, 3))
     mask = jnp.asarray(mask)
-    grid = anchor_grid(config.anchors, config.bev, plane)
-    anchors = select_anchors(config.anchors, config.bev, grid, camera, mask, plane)
+    if config.is_dense:  # has no anchors, and choosing them would cost as much as the map
+        none = jnp.zeros(0, jnp.int32)
+        anchors = Anchors(jnp.zeros((0, 6)), none, none > 0, jnp.zeros((), jnp.int32))
+    else:
+        grid = anchor_grid(config.anchors, config.bev, plane)
+        anchors = select_anchors(config.anchors, config.bev, grid, camera, mask, plane)
     return Inputs(
         image=image,
         bev=bev_maps(config.bev, camera, mask, plane),
@@ -254,4 +260,5 @@ def make_inputs(
         plane=plane,
         truth=truth,
         truth_mask=jnp.asarray(example.truth_mask),
+        told=jnp.zeros(2, jnp.float32) if told is None else told,
     )

@@ -174,14 +174,17 @@ def fail_sensor(
     if failure not in SENSOR_FAILURES:
         raise ValueError(f"failure={failure!r}: expected one of {', '.join(SENSOR_FAILURES)}")
     sensor, _, kind = failure.partition("_")
+    told = jnp.asarray(severity, jnp.float32) * jnp.array(
+        [sensor == "camera", sensor == "lidar"], jnp.float32
+    )
     if sensor == "camera":
         image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
         depth = frame_depth(config, example) if kind == "fog" else None
         failed_image = camera_failure(image, kind, severity, key=key, depth=depth)
-        return make_inputs(config, example, image=failed_image)
+        return make_inputs(config, example, image=failed_image, told=told)
     points, mask = jnp.asarray(example.points), jnp.asarray(example.point_mask)
     failed = lidar_failure(points, mask, kind, severity, key=key)
-    return make_inputs(config, example, points=failed)
+    return make_inputs(config, example, points=failed, told=told)
 
 
 def training_inputs(
@@ -193,8 +196,10 @@ def training_inputs(
     points, mask = jnp.asarray(example.points), jnp.asarray(example.point_mask)
     u = jax.random.uniform(which)
     failed = jnp.stack([u < 0.5 * train.failure_share, u >= 1.0 - 0.5 * train.failure_share])
+    told = jnp.zeros(2, jnp.float32)
     if train.failure_share > 0:
         severity = jax.random.uniform(strength, minval=train.severity, maxval=1.0)
+        told = severity * failed.astype(jnp.float32)
         kinds: dict[str, list[str]] = {"camera": [], "lidar": []}
         for name in train.failure_kinds:
             kinds[name.partition("_")[0]].append(name.partition("_")[2])
@@ -223,6 +228,7 @@ def training_inputs(
         mirror=jax.random.bernoulli(mirror) if train.flip else None,
         key=colour,
         colour_sd=train.colour_sd,
+        told=told,
     )
     return inputs, failed
 

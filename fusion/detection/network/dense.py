@@ -76,6 +76,12 @@ class _Output(nn.Module):
         return y + _RARE * jax.nn.one_hot(0, N_OUTPUTS, dtype=y.dtype)[None, None, None]
 
 
+def _told(severity: Float[Array, "b 2"]) -> Float[Array, "b 4"]:
+    """What the oracle's gate reads in place of log odds: fails or works (+-4), and how severely."""
+    flags = jnp.where(severity > 0.0, 4.0, -4.0).astype(severity.dtype)
+    return jnp.concatenate([flags, 4.0 * severity], axis=-1)
+
+
 def _double(x: Array, like: Array) -> Array:
     """Twice the resolution, cut to the size of another map."""
     return x.repeat(2, axis=1).repeat(2, axis=2)[:, : like.shape[1], : like.shape[2]]
@@ -96,9 +102,9 @@ class DenseDetector(nn.Module):
         self.near = [_Block(half, 2), _Block(half)]
         self.wide = [_Block(quarter, 2), _Block(quarter)]
         self.joined, self.lifted = _Block(half), _Block(half, size=1)
-        if c.gated:
+        if c.weighs:
             self.gate = GridGate(c.gate_width, c.normalizer)
-            if c.gate_statistics:
+            if c.gated and c.gate_statistics:
                 self.quality = QualityHead(c.gate_width)
         top, low = d.trunk_widths
         self.fused = [_Block(top), _Block(top)]
@@ -121,13 +127,20 @@ class DenseDetector(nn.Module):
         lidar = teach_if_alive(lidar, inputs.bev)
         b = camera.shape[0]
         failed = jnp.full((b, 2), jnp.nan)
-        if not self.config.gated:
+        if self.config.fixed_weights is not None:
+            fixed = jnp.asarray(self.config.fixed_weights, jnp.float32)
+            return Grids(camera, lidar, jnp.broadcast_to(fixed[None], (b, 2)), failed)
+        if not self.config.weighs:
             return Grids(camera, lidar, jnp.full((b, 2), 0.5), failed)
         # The gate reads the views and does not train them.
         views = jax.lax.stop_gradient((camera, lidar))
-        if not self.config.gate_statistics:
+        statistics = None
+        if self.config.gate_statistics:
+            statistics = quality_statistics(self.config.bev, inputs.image, inputs.bev)
+        if self.config.is_oracle:
+            return Grids(camera, lidar, self.gate(views, statistics, _told(inputs.told)), failed)
+        if statistics is None:
             return Grids(camera, lidar, self.gate(views), failed)
-        statistics = quality_statistics(self.config.bev, inputs.image, inputs.bev)
         failed = self.quality(statistics)
         return Grids(camera, lidar, self.gate(views, statistics, failed), failed)
 
@@ -177,7 +190,7 @@ def _shapes(config: DetectorConfig) -> Inputs:
     return Inputs(
         image=of(*config.image_size, 3), bev=of(*config.bev.shape, config.bev.n_slices + 1),
         anchors=none, anchor_mask=none, n_occupied=none, p2=of(3, 4), image_size=of(2),
-        plane=of(4), truth=none, truth_mask=none,
+        plane=of(4), truth=none, truth_mask=none, told=of(2),
     )  # fmt: skip
 
 

@@ -110,9 +110,9 @@ class GridGate(nn.Module):
         self,
         grids: tuple[Array, ...],
         statistics: Float[Array, "b n"] | None = None,
-        failed: Float[Array, "b k"] | None = None,
+        failed: Float[Array, "b t"] | None = None,
     ) -> Float[Array, "b k"]:
-        """Weights of the views for every frame."""
+        """Weights of the views for every frame; the oracle's gate is told more than log odds."""
         parts = [x.mean(axis=(1, 2)) for x in grids]
         parts += [jnp.sqrt(x.var(axis=(1, 2)) + 1e-6) for x in grids]
         parts += [] if statistics is None else [statistics]

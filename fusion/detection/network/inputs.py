@@ -18,6 +18,8 @@ class Inputs(NamedTuple):
         p2: `[3, 4]` projection; image_size: `[2]` original rows and columns.
         plane: `[4]` ground plane.
         truth, truth_mask: `[g, 7]` labelled boxes and which rows hold one.
+        told: `[2]` severity of the failure of (camera, lidar), 0 while it works; only the gate of
+            `dense_oracle` reads it.
     """
 
     image: Array
@@ -30,3 +32,4 @@ class Inputs(NamedTuple):
     plane: Array
     truth: Array
     truth_mask: Array
+    told: Array

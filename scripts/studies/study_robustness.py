@@ -1,0 +1,305 @@
+"""Detectors under every sensor failure and severity, kinds that training never saw, and a bound.
+
+    python scripts/simulate_kitti.py --layouts KITTI/training/label_2 --frames 2400 --val 100 \
+        --test 100 --size small --out SIM
+    python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test
+    python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test \
+        --fold seed
+
+trains every model on the same frames with the same failures (one sensor fails in two thirds of
+them), measures 3D moderate R40 with all sensors working and in every cell of failure and severity,
+and writes `results/study_robustness.json` (`_val` is added to tables of the validation frames, on
+which settings are chosen) and the paired differences to `dense` beside it.
+
+`dense_oracle` is told which sensor fails and how severely: no gate of this network can know more.
+`camera_only` and `lidar_only` are the trained `dense` with the fusion weights fixed at (1, 0) and
+(0, 1), which path drop in training prepares it for.
+
+`--fold` leaves a third of the failures out of the training (0, 1, 2, or `seed` for the seed modulo
+three): the row `unseen kinds` is their mean, `seen kinds (folds)` that of the others. Every
+training and every cell is kept as it comes, seeds whole first, so the same command goes on after an
+interruption; `--collect-only` writes the table of what is there. Prints `result: ...` at the end.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, Literal
+
+from snn_fusion_failure.commands import detector_options as choices
+from snn_fusion_failure.commands import detector_runs as runs
+from snn_fusion_failure.commands.detector_cells import (
+    METRIC,
+    Cell,
+    measure_cells,
+    read_cells,
+    read_frames,
+)
+from snn_fusion_failure.commands.detector_robustness import summarize_cells
+from snn_fusion_failure.records.rows import record_comparisons, record_table, summarize
+from snn_fusion_failure.runs import print_result, repository, run_command
+
+MODELS: tuple[choices.Model, ...] = (
+    "dense", "dense_argate", "dense_oracle", "avod", "avod_argate",
+)  # fmt: skip
+BASELINE = "dense"
+SINGLE = {"camera_only": (1.0, 0.0), "lidar_only": (0.0, 1.0)}
+"""Detectors of one sensor, made from the trained baseline by fixed fusion weights."""
+FOLDS = (
+    ("camera_noise", "camera_fog", "lidar_loss"),
+    ("camera_blackout", "lidar_noise", "lidar_sector_dropout"),
+    ("camera_blur", "camera_exposure", "lidar_beam_loss"),
+)
+"""Kinds that are left out of the training together; each group has both sensors."""
+Fold = Literal["none", "0", "1", "2", "seed"]
+METRICS = (METRIC, "weight_auroc", "failed_auroc")
+
+
+@dataclasses.dataclass(frozen=True)
+class Config:
+    """Train and evaluate detectors under failures."""
+
+    data: Path
+    """KITTI folder, simulated or real."""
+    cache: Path | None = None
+    """Where the prepared examples go; DATA/cache_SIZE when left out."""
+    seeds: int = 3
+    first_seed: int = 0
+    models: tuple[choices.Model, ...] = MODELS
+    size: choices.SizeOption = "small"
+    steps: int | None = None
+    levels: tuple[int, ...] = (1, 2, 3, 4, 5)
+    """Severities in fifths."""
+    kinds: tuple[str, ...] = ()
+    """Failures to evaluate; all when left out."""
+    fold: Fold = "none"
+    """Group of failures that training does not see."""
+    split: Literal["val", "test"] = "val"
+    """Frames to evaluate: `val` to choose settings, `test` for the numbers of record."""
+    overlap: float = 0.7
+    """Least overlap of a hit."""
+    any_size: bool = False
+    """Accept images of other sizes than the benchmark's (simulated frames)."""
+    changes: choices.Changes = ()
+    """Constants of all trainings, `detector.path_drop=0` `params.gate.tau=0.2`."""
+    out: Path = Path("runs/study_robustness")
+    """Folder of the trainings."""
+    results: Path = repository.RESULTS
+    name: str = "study_robustness"
+    """Of the table."""
+    collect_only: bool = False
+
+
+@dataclasses.dataclass(frozen=True)
+class Training:
+    """One training of the study: a model, a seed, and the fold whose kinds it does not see."""
+
+    model: choices.Model
+    seed: int
+    fold: int | None
+
+    def folder(self, config: Config) -> Path:
+        """Where it is kept."""
+        fold = "" if self.fold is None else f"_fold{self.fold}"
+        return config.out / config.size / f"{self.model}{fold}_s{self.seed}"
+
+    @property
+    def unseen(self) -> tuple[str, ...]:
+        """Kinds left out of the training."""
+        return () if self.fold is None else FOLDS[self.fold]
+
+
+def trainings(config: Config) -> list[Training]:
+    """What a command line trains, whole seeds first."""
+
+    def fold(seed: int) -> int | None:
+        if config.fold == "none":
+            return None
+        return seed % len(FOLDS) if config.fold == "seed" else int(config.fold)
+
+    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    return [Training(model, seed, fold(seed)) for seed in seeds for model in config.models]
+
+
+def cells(config: Config) -> list[Cell]:
+    """The clean cell, then every failure at every severity.
+
+    Raises:
+        ValueError: an unknown failure, or a severity that is not 1 to 5.
+    """
+    from fusion.detection.learning.training import SENSOR_FAILURES
+
+    unknown = [kind for kind in config.kinds if kind not in SENSOR_FAILURES]
+    if unknown:
+        raise ValueError(f"kinds={unknown[0]!r}: expected of {', '.join(SENSOR_FAILURES)}")
+    if not config.levels or not all(1 <= level <= 5 for level in config.levels):
+        raise ValueError(f"levels={config.levels}: expected severities from 1 to 5")
+    kinds = config.kinds or SENSOR_FAILURES
+    return [Cell(), *(Cell(kind, level) for kind in kinds for level in config.levels)]
+
+
+def _options(config: Config, training: Training) -> choices.Train:
+    from fusion.detection.learning.training import SENSOR_FAILURES
+
+    run = training.folder(config)
+    seen = tuple(kind for kind in SENSOR_FAILURES if kind not in training.unseen)
+    return choices.Train(
+        config.data, training.model, config.size, config.cache, seed=training.seed,
+        steps=config.steps, failures=True, failure_kinds=seen if training.unseen else (),
+        changes=config.changes, out=run, resume=(run / "config.json").exists(),
+    )  # fmt: skip
+
+
+def _variants(config: Config, training: Training) -> Iterator[tuple[str, dict[str, Any], Path]]:
+    """Detectors that one training gives: name, changes of its settings, folder of cells."""
+    folder = training.folder(config)
+    yield training.model, {}, folder / f"cells_{config.split}"
+    if training.model == BASELINE:
+        for name, weights in SINGLE.items():
+            yield name, {"fixed_weights": weights}, folder / f"cells_{config.split}_{name}"
+
+
+def execute(config: Config) -> int:
+    """Do what is missing; returns the number of cells measured."""
+    from fusion.detection.learning.cache import open_cache
+    from snn_fusion_failure.commands import train_detector as command
+
+    prepared = choices.Prepare(config.data, config.size, config.cache, any_size=config.any_size)
+    folder = runs.cache_folder(prepared)
+    if not (folder / "cache.json").exists():
+        command.prepare(prepared)
+    if config.split not in open_cache(folder).splits:
+        command.prepare(dataclasses.replace(prepared, splits=(config.split,), add=True))
+    cache = open_cache(folder)
+    frames = read_frames(config.data, cache, config.split)
+    wanted, done = cells(config), 0
+    for training in trainings(config):
+        options = _options(config, training)
+        setup, run = runs.build(options, cache), training.folder(config)
+        runs.check_settings(run, setup)
+        if not (run / "result.json").exists():
+            print(f"train {run.name}", flush=True)
+            command.train(options)
+        state = runs.load_run(run, setup)
+        for name, changes, kept in _variants(config, training):
+            detector = dataclasses.replace(setup.config, **changes)
+            measured = measure_cells(
+                detector, state, frames, wanted, kept, overlap=config.overlap, seed=training.seed
+            )
+            done += measured
+            if measured:
+                found = read_cells(kept, [Cell()])
+                assert found is not None
+                print(f"{run.name}, {name}: clean {found[Cell()][METRIC]:.2f}", flush=True)
+    return done
+
+
+def _means(found: dict[Cell, dict[str, float]], base: Any, kinds: Any) -> dict[str, float]:
+    """Scores over the cells of some kinds: means, mRA and, against the baseline, mCE."""
+
+    def by_kind(scores: dict[Cell, dict[str, float]]) -> dict[str, dict[str, float]]:
+        out: dict[str, dict[str, float]] = {}
+        for cell, values in scores.items():
+            if cell.failure in kinds:
+                out.setdefault(cell.failure, {})[str(cell.level)] = values[METRIC]
+        return out
+
+    clean = found[Cell()][METRIC]
+    summary = summarize_cells(clean, by_kind(found), None if base is None else by_kind(base))
+    means = {METRIC: summary.pop("mean"), **summary}
+    for metric in METRICS[1:]:
+        values = [v[metric] for c, v in found.items() if c.failure in kinds and metric in v]
+        if values:
+            means[metric] = sum(values) / len(values)
+    return means
+
+
+def _rows_of(
+    training: Training, found: Any, base: Any, kinds: set[str | None]
+) -> dict[str, dict[str, float]]:
+    """Rows of one training: single cells where it saw all kinds, else means of both groups."""
+    if training.fold is None:
+        single = {cell.name: values for cell, values in found.items()}
+        return single | {"seen kinds": _means(found, base, kinds)}
+    unseen = kinds & set(training.unseen)
+    rows = {"clean (folds)": found[Cell()]}
+    groups = {"unseen kinds": unseen, "seen kinds (folds)": kinds - unseen}
+    return rows | {row: _means(found, base, group) for row, group in groups.items() if group}
+
+
+def scores(config: Config) -> dict[tuple[str, str], dict[int, dict[str, float]]]:
+    """(row, model) -> seed -> metric -> value, of every training whose cells are complete.
+
+    Where a seed was trained with several folds, its value is their mean.
+    """
+    wanted = cells(config)
+    kinds = {cell.failure for cell in wanted[1:]}
+    held: dict[tuple[str, str], dict[int, list[dict[str, float]]]] = {}
+    seeds = range(config.first_seed, config.first_seed + config.seeds)
+    for seed, fold in itertools.product(seeds, (None, *range(len(FOLDS)))):
+        baseline = Training(BASELINE, seed, fold).folder(config) / f"cells_{config.split}"
+        base = read_cells(baseline, wanted)
+        for model in MODELS:
+            training = Training(model, seed, fold)
+            for name, _, kept in _variants(config, training):
+                found = read_cells(kept, wanted)
+                for row, values in (
+                    _rows_of(training, found, base, kinds) if found else {}
+                ).items():
+                    held.setdefault((row, name), {}).setdefault(seed, []).append(values)
+    return {
+        key: {
+            seed: {m: sum(v[m] for v in parts) / len(parts) for m in parts[0]}
+            for seed, parts in by_seed.items()
+        }
+        for key, by_seed in held.items()
+    }
+
+
+def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
+    """Rows of the table of record, and paired differences of 3D moderate of the means."""
+    from snn_fusion_failure.records.statistics import paired_test
+
+    held = scores(config)
+    rows, pairs = [], []
+    for (row, model), by_seed in held.items():
+        for metric in (*METRICS, "mra", "mce"):
+            values = [v[metric] for v in by_seed.values() if metric in v]
+            if values and len(values) == len(by_seed):
+                unit = "%" if metric == METRIC else "1"
+                cell = {"row": row, "model": model, "metric": metric, "unit": unit}
+                rows.append(cell | {"split": config.split} | summarize(values))
+        base = held.get((row, "avod" if model == "avod_argate" else BASELINE), {})
+        shared = sorted(base.keys() & by_seed.keys())
+        if row.startswith(("clean", "seen", "unseen")) and model != BASELINE and len(shared) > 1:
+            other = "avod" if model == "avod_argate" else BASELINE
+            a, b = ([scores[s][METRIC] for s in shared] for scores in (by_seed, base))
+            comparison = {"row": row, "comparison": f"{model} - {other}", "metric": METRIC}
+            pairs.append(comparison | paired_test(a, b)._asdict())
+    return rows, pairs
+
+
+def main(config: Config) -> dict[str, Any]:
+    """Do the trainings and cells that are missing, then write the tables."""
+    done = 0 if config.collect_only else execute(config)
+    rows, pairs = collect(config)
+    table = config.name if config.split == "test" else f"{config.name}_val"
+    if rows:
+        title = f"Car detection by sensor failure and severity ({config.split} frames)"
+        record_table(config.results / f"{table}.json", table, title, rows, preset=config.size)
+        if pairs:
+            record_comparisons(config.results, table, title, pairs, preset=config.size)
+    fields = {
+        f"{row['model']}_{row['row'].replace(' ', '_')}": row["mean"]
+        for row in rows
+        if row["metric"] == METRIC and row["row"] in ("clean", "seen kinds", "unseen kinds")
+    }
+    print_result(cells=done, rows=len(rows), **fields)
+    return {"rows": rows}
+
+
+if __name__ == "__main__":
+    run_command(Config, main, description=__doc__)

@@ -1,0 +1,128 @@
+"""The study of robustness: rows from cells on disk, and a run of it on tiny frames."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import pytest
+
+from fusion.detection.learning.training import SENSOR_FAILURES
+from snn_fusion_failure.commands.detector_cells import Cell, read_cells
+from tests._scripts import load_script
+from tests.snn_fusion_failure.test_train_detector import write_frame
+
+study = load_script("studies/study_robustness")
+
+
+def _write(folder: Path, cell: Cell, precision: float, camera: tuple[float, float]) -> None:
+    """A cell of two frames with these camera weights, which tell the failure as 1 - weight."""
+    folder.mkdir(parents=True, exist_ok=True)
+    weights = [[w, 1 - w] for w in camera]
+    record = {
+        "3d_moderate_r40": precision,
+        "weights": weights,
+        "failed": [w[::-1] for w in weights],
+    }
+    (folder / f"{cell.name.replace(' ', '_')}.json").write_text(json.dumps(record))
+
+
+def _config(tmp_path: Path, **changes: object) -> object:
+    return study.Config(
+        tmp_path, kinds=("camera_fog", "lidar_noise"), levels=(2, 5), out=tmp_path / "runs",
+        results=tmp_path / "results", split="test", seeds=2, collect_only=True, **changes,
+    )  # fmt: skip
+
+
+def test_every_kind_is_left_out_once() -> None:
+    assert sorted(kind for fold in study.FOLDS for kind in fold) == sorted(SENSOR_FAILURES)
+    for fold in study.FOLDS:
+        assert {kind.partition("_")[0] for kind in fold} == {"camera", "lidar"}
+    config = study.Config(Path("x"), seeds=2, models=("dense", "avod"), fold="seed")
+    names = [training.folder(config).name for training in study.trainings(config)]
+    assert names == ["dense_fold0_s0", "avod_fold0_s0", "dense_fold1_s1", "avod_fold1_s1"]
+    with pytest.raises(ValueError, match=r"levels=\(6,\): expected severities from 1 to 5"):
+        study.cells(study.Config(Path("x"), levels=(6,)))
+    with pytest.raises(ValueError, match="kinds='rain': expected of camera_noise"):
+        study.cells(study.Config(Path("x"), kinds=("rain",)))
+
+
+def test_rows_are_means_of_the_cells(tmp_path: Path) -> None:
+    config = _config(tmp_path)
+    cells = study.cells(config)
+    assert [cell.name for cell in cells] == [
+        "clean", "camera_fog 2", "camera_fog 5", "lidar_noise 2", "lidar_noise 5",
+    ]  # fmt: skip
+    precision = {"dense": (50, 40, 30, 20, 10), "dense_argate": (60, 50, 40, 24, 12)}
+    for model, values in precision.items():
+        for seed in (0, 1):
+            kept = study.Training(model, seed, None).folder(config) / "cells_test"
+            for cell, value in zip(cells, values, strict=True):
+                failing = cell.failure == "camera_fog"
+                _write(kept, cell, value - seed, (0.1, 0.5) if failing else (0.5, 0.6))
+    # A seed that is not complete counts nowhere.
+    _write(study.Training("avod", 0, None).folder(config) / "cells_test", Cell(), 1.0, (0.5, 0.5))
+    # Fold 0 leaves out the fog, fold 1 the noise of the lidar; a seed with both has their mean.
+    for fold, values in ((0, (50, 20, 10, 30, 30)), (1, (50, 30, 30, 0, 6))):
+        kept = study.Training("dense", 0, fold).folder(config) / "cells_test"
+        for cell, value in zip(cells, values, strict=True):
+            _write(kept, cell, value, (0.5, 0.5))
+    study.main(config)
+    table = json.loads((tmp_path / "results" / "study_robustness.json").read_text())
+    held = {(r["row"], r["model"], r["metric"]): r["values"] for r in table["rows"]}
+    assert held["clean", "dense", "3d_moderate_r40"] == [50, 49]
+    assert held["camera_fog 2", "dense_argate", "3d_moderate_r40"] == [50, 49]
+    assert held["seen kinds", "dense", "3d_moderate_r40"] == [25, 24]
+    assert held["seen kinds", "dense", "mra"] == pytest.approx([0.5, 24 / 49])
+    assert held["seen kinds", "dense", "mce"] == [1.0, 1.0]
+    wanted = [0.5 * ((110 + 2 * s) / (130 + 2 * s) + (164 + 2 * s) / (170 + 2 * s)) for s in (0, 1)]
+    assert held["seen kinds", "dense_argate", "mce"] == pytest.approx(wanted)
+    # Of four pairs of frames three have the lower weight while the camera fails, one is a tie.
+    assert held["camera_fog 2", "dense", "weight_auroc"] == pytest.approx([0.875] * 2)
+    assert held["camera_fog 2", "dense", "failed_auroc"] == pytest.approx([0.875] * 2)
+    assert ("clean", "dense", "weight_auroc") not in held
+    assert held["unseen kinds", "dense", "3d_moderate_r40"] == [(15 + 3) / 2]
+    assert held["seen kinds (folds)", "dense", "3d_moderate_r40"] == [30]
+    assert not [key for key in held if key[1] == "avod"]
+    pairs = json.loads((tmp_path / "results" / "study_paired_study_robustness.json").read_text())
+    found = {(row["row"], row["comparison"]): row["difference"] for row in pairs["rows"]}
+    assert found["seen kinds", "dense_argate - dense"] == pytest.approx(6.5)
+    assert found["clean", "dense_argate - dense"] == pytest.approx(10.0)
+
+
+@pytest.mark.slow
+@pytest.mark.relaxed
+def test_tiny_frames_go_all_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    root = tmp_path / "kitti"
+    for i in range(4):
+        write_frame(root, f"{i:06d}", i)
+    (root / "ImageSets").mkdir()
+    (root / "ImageSets" / "train.txt").write_text("000000\n000001\n")
+    (root / "ImageSets" / "val.txt").write_text("000002\n000003\n")
+    options = study.Config(
+        root, seeds=1, models=("dense", "dense_oracle"), size="tiny", steps=4, levels=(5,),
+        kinds=("camera_blackout", "lidar_loss"), fold="1", any_size=True,
+        out=tmp_path / "runs", results=tmp_path / "results",
+    )  # fmt: skip
+    study.main(options)
+    table = json.loads((tmp_path / "results" / "study_robustness_val.json").read_text())
+    rows = {(row["row"], row["model"]) for row in table["rows"]}
+    for model in ("dense", "dense_oracle", "camera_only", "lidar_only"):
+        assert {("clean (folds)", model), ("seen kinds (folds)", model)} <= rows
+        assert ("unseen kinds", model) in rows  # the blackout, which fold 1 leaves out
+    run = tmp_path / "runs" / "tiny" / "dense_fold1_s0"
+    settings = json.loads((run / "result.json").read_text())["settings"]["training"]
+    assert "camera_blackout" not in settings["failure_kinds"]
+    assert "lidar_loss" in settings["failure_kinds"]
+    held = json.loads((run / "cells_val_camera_only" / "lidar_loss_5.json").read_text())
+    assert held["weights"] == [[1.0, 0.0]] * 2 and held["failed"] is None
+    # Without its camera's failure the oracle weighs as the clean frames say.
+    oracle = tmp_path / "runs" / "tiny" / "dense_oracle_fold1_s0" / "cells_val"
+    weights = [json.loads((oracle / f"{n}.json").read_text())["weights"][0]
+               for n in ("clean", "camera_blackout_5")]  # fmt: skip
+    assert weights[0] != weights[1]
+    assert read_cells(oracle, [Cell(), Cell("camera_fog", 5)]) is None
+    capsys.readouterr()
+    study.main(dataclasses.replace(options))
+    assert "result: cells=0" in capsys.readouterr().out.splitlines()[-1]

@@ -84,7 +84,7 @@ def _dense(size: str, made: DetectorSetup) -> DetectorSetup:
         dense = DenseConfig(lidar_width=64, camera_widths=(32, 64), trunk_widths=(64, 128))
     elif size == "small":
         dense = DenseConfig()
-        train = dataclasses.replace(train, steps=1500, batch_size=2)
+        train = dataclasses.replace(train, steps=6000, batch_size=2)
     else:
         dense = DenseConfig(lidar_width=8, camera_widths=(4, 8), trunk_widths=(8, 8), candidates=16)
     config = dataclasses.replace(config, dense=dense, regression_weight=1.0, norm="group")

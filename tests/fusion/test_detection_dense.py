@@ -84,7 +84,7 @@ def test_losses_by_hand() -> None:
     got = grid_losses(outputs, targets)
     # Heat 0.5 everywhere: 1/4 log 2 for the centre and for cold cells, a 16th of it beside it.
     np.testing.assert_allclose(got[0], 0.25 * np.log(2) * (1 + 2 + 0.5**4), rtol=1e-5)
-    np.testing.assert_allclose(got[1], 1.5, rtol=1e-6)
+    np.testing.assert_allclose(got[1], 2.0, rtol=1e-6)
     np.testing.assert_allclose(got[2], np.log(2), rtol=1e-5)
 
 

@@ -21,6 +21,7 @@ from fusion.detection.kitti.calibration import Calibration
 from fusion.detection.kitti.files import Frame
 from fusion.detection.kitti.objects import Objects
 from fusion.detection.learning import fitting
+from fusion.detection.learning.augmentation import flip
 from fusion.detection.learning.detection_loss import (
     balanced_class_loss,
     class_loss,
@@ -28,7 +29,6 @@ from fusion.detection.learning.detection_loss import (
 )
 from fusion.detection.learning.examples import (
     Example,
-    flip,
     make_example,
     make_inputs,
     stack_examples,

@@ -1,5 +1,6 @@
 """Examples, losses, training, detection and scoring."""
 
+from fusion.detection.learning.augmentation import flip, in_area, turn_and_scale
 from fusion.detection.learning.cache import (
     TESTING,
     Cache,
@@ -22,7 +23,6 @@ from fusion.detection.learning.detection_loss import (
 )
 from fusion.detection.learning.examples import (
     Example,
-    flip,
     frame_depth,
     make_example,
     make_inputs,
@@ -107,6 +107,7 @@ __all__ = [
     "grid_losses",
     "grid_targets",
     "image_scale",
+    "in_area",
     "init_training",
     "interrupt_between_steps",
     "learning_rate",
@@ -127,6 +128,7 @@ __all__ = [
     "to_objects",
     "train_step",
     "training_inputs",
+    "turn_and_scale",
     "weight_auroc",
     "write_example",
 ]

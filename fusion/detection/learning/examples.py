@@ -20,6 +20,7 @@ from fusion.detection.geometry.bev import bev_maps
 from fusion.detection.geometry.planes import PlaneConfig, fit_plane, height_above
 from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
 from fusion.detection.kitti.files import Frame
+from fusion.detection.learning.augmentation import flip, in_area, turn_and_scale
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.sensors.depth import depth_image
 
@@ -168,33 +169,6 @@ def stack_examples(examples: Sequence[Example]) -> Example:
     return Example(*(np.stack(column) for column in zip(*examples, strict=True)))
 
 
-def flip(
-    image: Float[Array, "h w 3"],
-    points: Float[Array, "p 3"],
-    p2: Float[Array, "3 4"],
-    width: Float[Array, ""],
-    plane: Float[Array, "4"],
-    truth: Float[Array, "g 7"],
-) -> tuple[Array, Array, Array, Array, Array]:
-    """A frame seen in a mirror: x of the camera frame changes sign.
-
-    Returns:
-        image, points, p2, plane, truth; column u becomes width - 1 - u.
-    """
-    mirror = jnp.array([-1.0, 1.0, 1.0])
-    rows = jnp.stack([(width - 1.0) * p2[2] - p2[0], p2[1], p2[2]])
-    new_p2 = rows * jnp.array([[-1.0, 1.0, 1.0, 1.0]])
-    yaw = jnp.mod(jnp.pi - truth[:, 6] + jnp.pi, 2 * jnp.pi) - jnp.pi
-    boxes = truth.at[:, 0].multiply(-1.0).at[:, 6].set(yaw)
-    return (
-        image[:, ::-1],
-        points * mirror[None],
-        new_p2,
-        plane * jnp.array([-1.0, 1.0, 1.0, 1.0]),
-        boxes,
-    )
-
-
 def frame_depth(config: DetectorConfig, example: Example) -> Float[Array, "h w"]:
     """Distance of what each pixel of the frame's resized image shows [m], inside jit."""
     to_camera = jnp.asarray(example.to_camera)
@@ -211,6 +185,7 @@ def make_inputs(
     image: Float[Array, "h w 3"] | None = None,
     points: tuple[Float[Array, "p 4"], Bool[Array, "p"]] | None = None,
     mirror: Bool[Array, ""] | None = None,
+    turn: tuple[Float[Array, ""], Float[Array, ""]] | None = None,
     key: PRNGKeyArray | None = None,
     colour_sd: float = 0.0,
     told: Float[Array, "2"] | None = None,
@@ -223,6 +198,7 @@ def make_inputs(
         image, points: readings that replace the example's, such as those of a failed sensor; the
             image in [0, 1].
         mirror: flip the frame.
+        turn: angle [rad] and factor of `turn_and_scale`; cars that leave the area are no labels.
         key, colour_sd: shift of the colour channels in training, standard deviation in [0, 1].
         told: severity of the failure of (camera, lidar), for the oracle; zeros when left out.
     """
@@ -239,6 +215,10 @@ def make_inputs(
         image, camera, p2, plane, truth = jax.tree.map(
             lambda a, b: jnp.where(mirror, a, b), flipped, plain
         )
+    truth_mask = jnp.asarray(example.truth_mask)
+    if turn is not None:
+        camera, p2, plane, truth = turn_and_scale(*turn, camera, p2, plane, truth)
+        truth_mask = truth_mask & in_area(config.bev, truth)
     image = image - jnp.array(MEAN_RGB)[None, None]
     if key is not None and colour_sd > 0:
         image = image + colour_sd * jax.random.normal(key, (1, 1, 3))
@@ -259,6 +239,6 @@ def make_inputs(
         image_size=size,
         plane=plane,
         truth=truth,
-        truth_mask=jnp.asarray(example.truth_mask),
+        truth_mask=truth_mask,
         told=jnp.zeros(2, jnp.float32) if told is None else told,
     )

@@ -6,6 +6,7 @@ Pure functions; jit is the caller's. Both models see the same failures for the s
 from __future__ import annotations
 
 import dataclasses
+import math
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -48,6 +49,8 @@ class DetectorTrainConfig:
         schedule: of the learning rate; `staircase` multiplies by 0.8 every 30,000 steps, `cosine`
             falls to zero after a warm-up over the first 5 %.
         flip: mirror half of the frames; colour_sd: shift of the colour channels.
+        rotation: largest angle that the scene is turned by [degree]; scaling: largest change of its
+            size as a share; both drawn evenly, see `turn_and_scale`.
         failure_share: frames in which one sensor fails (half camera, half lidar); the source keeps
             a third clean in its other experiments.
         severity: least severity of these failures; drawn evenly up to 1.
@@ -66,6 +69,8 @@ class DetectorTrainConfig:
     schedule: Literal["staircase", "cosine"] = "staircase"
     flip: bool = True
     colour_sd: float = 0.02
+    rotation: float = 0.0
+    scaling: float = 0.0
     failure_share: float = 0.0
     severity: float = 0.5
     failure_kinds: tuple[str, ...] = SENSOR_FAILURES
@@ -80,6 +85,11 @@ class DetectorTrainConfig:
             raise ValueError(f"schedule={self.schedule!r}: expected 'staircase' or 'cosine'")
         if not 0 <= self.colour_sd < 1:
             raise ValueError(f"colour_sd={self.colour_sd}: expected a standard deviation in [0, 1)")
+        if not (0 <= self.rotation <= 45 and 0 <= self.scaling < 0.5):
+            raise ValueError(
+                f"rotation={self.rotation}, scaling={self.scaling}: expected an angle up to 45 "
+                "degrees and a share below 0.5"
+            )
         if not (0 <= self.failure_share <= 1 and 0 < self.severity <= 1):
             raise ValueError(
                 f"failure_share={self.failure_share}, severity={self.severity}: expected shares "
@@ -220,12 +230,17 @@ def training_inputs(
             lambda: random_lidar_failure(points, mask, severity, kinds=kinds["lidar"], key=noise),
             lambda: (points, mask),
         )
+    turn = None
+    if train.rotation or train.scaling:
+        u = jax.random.uniform(jax.random.fold_in(mirror, 1), (2,), minval=-1.0, maxval=1.0)
+        turn = math.radians(train.rotation) * u[0], 1.0 + train.scaling * u[1]
     inputs = make_inputs(
         config,
         example,
         image=image,
         points=(points, mask),
         mirror=jax.random.bernoulli(mirror) if train.flip else None,
+        turn=turn,
         key=colour,
         colour_sd=train.colour_sd,
         told=told,

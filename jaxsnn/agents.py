@@ -18,7 +18,7 @@ from jaxsnn.config import NetworkConfig, NetworkParams, check_network
 from jaxsnn.encoding import RateTable, group_rates, interval_rates, poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
 from jaxsnn.rewards import motor_rewards, scale_by_remaining_turn, terminal_reward
-from jaxsnn.turn_goal import turn_reward, update_recent_turn
+from jaxsnn.turn_goal import turn_reward, update_recent_turn, way_reward
 from jaxsnn.window import STDPKernel
 from jaxsnn.world import Outcome, Reading
 
@@ -112,10 +112,11 @@ def input_rates(
         recent_turn: leaky mean of the last turns [deg], for `config.turn_groups`.
         table: `config.rates`, worked out once.
     """
+    sensed = (reading.sonar, reading.distance, reading.angle)
     if config.input_code == "interval":
-        rates = interval_rates(params.interval_rate, *reading)
+        rates = interval_rates(params.interval_rate, *sensed)
     else:
-        rates = group_rates(config.rates if table is None else table, *reading)
+        rates = group_rates(config.rates if table is None else table, *sensed)
     if config.turn_groups:
         both = jnp.clip(jnp.stack([recent_turn, -recent_turn]) / 60.0, 0.0, 1.0)
         rates = jnp.concatenate([rates, (params.turn_rate * both).astype(rates.dtype)])
@@ -152,6 +153,8 @@ def snn_agent(
         turn = steering_angle(constants, window.output_count / window.duration)
         if reward is not None:
             return reward(constants, reading, recent_turn, turn)
+        if config.guidance == "way":
+            return way_reward(constants.goal, reading, turn)
         if config.guidance == "graded":
             return turn_reward(constants.goal, reading, recent_turn, turn)
         rewards = motor_rewards(

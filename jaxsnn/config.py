@@ -49,7 +49,8 @@ class NetworkConfig:
         turn_groups: two more input groups fire in proportion to the robot's recent turns to the
             left and to the right: what a network without recurrence has of memory.
         guidance: rewards on the way by the "nearest" obstacle (the source) or "graded" from all
-            sonars (`turn_goal.turn_reward`).
+            sonars (`turn_goal.turn_reward`), or by the turn onto the shortest "way" from a trainer
+            that knows the map (`turn_goal.way_reward`).
 
     Raises:
         ValueError, TypeError: what makes no network, by name and value.
@@ -70,7 +71,7 @@ class NetworkConfig:
     reward_timing: Literal["before", "after"] = "before"
     input_code: InputCode = "sensor"
     turn_groups: bool = False
-    guidance: Literal["nearest", "graded"] = "nearest"
+    guidance: Literal["nearest", "graded", "way"] = "nearest"
 
     def __post_init__(self) -> None:
         """Refuse sizes and choices that make no network."""
@@ -101,7 +102,7 @@ class NetworkConfig:
             "reward_timing": ("before", "after"),
             "input_code": tuple(GROUPS),
             "turn_groups": (False, True),
-            "guidance": ("nearest", "graded"),
+            "guidance": ("nearest", "graded", "way"),
         }
         for name, allowed in choices.items():
             require_choice(name, getattr(self, name), allowed)

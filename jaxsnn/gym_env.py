@@ -42,7 +42,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
     Args:
         params: the map.
         max_steps: control steps after which an episode is truncated.
-        way: from `way.way_length`: the reward counts progress along the shortest way.
+        way: from `ways.way_length`: the reward counts progress along the shortest way.
     """
 
     metadata: dict[str, Any] = {"render_modes": []}  # noqa: RUF012 - as the base class has it

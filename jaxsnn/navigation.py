@@ -103,8 +103,8 @@ def navigation_env(
 
     Args:
         params: the map.
-        way: from `way_length`; the reward counts progress along the shortest way instead of the
-            straight distance.
+        way: from `ways.way_length`; the reward counts progress along the shortest way instead of
+            the straight distance.
         max_steps: a trial that has not ended after so many control steps is truncated.
 
     Raises:

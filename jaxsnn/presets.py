@@ -3,7 +3,8 @@
 The reading "literal" is the source wherever it speaks; what it leaves open (window, learning rate,
 time constant of the eligibility trace, threshold) has our values in both. "tuned" adds options;
 "guided" takes an input group for each interval, memory of the last turns and a graded reward for
-maps that need a detour. `docs/snn_networks.md` says what each option does and how it was chosen.
+maps that need a detour; "way" is rewarded by a trainer that knows the way.
+`docs/snn_networks.md` says what each option does and how it was chosen.
 """
 
 from __future__ import annotations
@@ -77,6 +78,10 @@ READINGS["guided"] = {
     "stdp": READINGS["tuned"]["stdp"],
     "reward": READINGS["tuned"]["reward"],
 }
+READINGS["way"] = {
+    **READINGS["guided"],
+    "config": {**READINGS["guided"]["config"], "guidance": "way"},
+}
 # Learning rates relative to that of S4. The additive rule moves a weight by mV and the
 # multiplicative one by a fraction, and inputs of S1 and S2 fire at 0.4 times the rate. "tuned":
 # best success in testing on Scenarios 1 and 2 (results/study_snn_gamma.json).
@@ -84,6 +89,7 @@ GAMMA = {
     "literal": {"S1": 3.0, "S2": 1.0, "S3": 3.0, "S4": 1.0},
     "tuned": {"S1": 27.0, "S2": 9.0, "S3": 3.0, "S4": 1.0},
     "guided": {"S1": 3.0, "S2": 1.0, "S3": 3.0, "S4": 1.0},
+    "way": {"S1": 3.0, "S2": 1.0, "S3": 3.0, "S4": 1.0},
 }
 
 
@@ -100,7 +106,7 @@ def preset(
 
     Args:
         model: "S1", "S2", "S3" or "S4".
-        reading: "literal" or "tuned".
+        reading: "literal", "tuned", "guided" or "way".
         config, params, stdp, reward: changes of single fields.
 
     Returns:

@@ -130,3 +130,34 @@ def turn_reward(
     goal, weight = turn_goal(params, reading, recent_turn)
     error = weight * jnp.clip((goal - turn) / params.scale, -1.0, 1.0)
     return jnp.stack([-error, error])
+
+
+def way_reward(
+    params: TurnGoalParams, reading: Reading, turn: Float[Array, ""]
+) -> Float[Array, "2"]:
+    r"""Reward of the left and the right motor's synapses from a trainer that knows the map.
+
+    .. math:: r_{right} = -r_{left} = k\,\mathrm{clip}((\mathrm{clip}(\beta, -G, G) - \theta)
+              / \text{scale}, -1, 1)
+
+    with :math:`\beta` the turn onto the shortest way, G `towards` and k `target_weight`. The way is
+    not among what the network senses: weights, once frozen, drive by the sensors alone.
+
+    Args:
+        params: TurnGoalParams.
+        reading: with `way_turn`, of a map made by `ways.with_way`.
+        turn: what the motors ask for now, before it is cut off [deg].
+
+    Raises:
+        ValueError: the map has no ways.
+
+    Source: ours; the delta rule of Widrow and Hoff (1960).
+    """
+    if reading.way_turn is None:
+        raise ValueError(
+            "map.way=None: expected a map with its shortest ways for guidance='way'; learn on "
+            "ways.with_way(map)"
+        )
+    goal = jnp.clip(reading.way_turn, -params.towards, params.towards)
+    error = params.target_weight * jnp.clip((goal - turn) / params.scale, -1.0, 1.0)
+    return jnp.stack([-error, error])

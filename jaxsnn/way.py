@@ -10,18 +10,11 @@ from __future__ import annotations
 from typing import NamedTuple
 
 import jax.numpy as jnp
-import numpy as np
 from jaxtyping import Array, Float
-from scipy import ndimage, sparse
-from scipy.sparse import csgraph
-
-from jaxsnn._checks import require_positive
-from jaxsnn.planner import Obstacles
-from jaxsnn.world import WorldParams
 
 
 class WayLength(NamedTuple):
-    """Length of the shortest way on the points of a grid; made by `way_length`.
+    """Length of the shortest way on the points of a grid; made by `ways.way_length`.
 
     Attributes:
         lengths: from each point to the arrival circle, `[columns, rows]` [px]. A point where the
@@ -35,60 +28,6 @@ class WayLength(NamedTuple):
     cell: Float[Array, ""]
 
 
-def way_length(
-    map: WorldParams, *, cell: int | float = 10.0, clearance: int | float | None = None
-) -> WayLength:
-    """Shortest ways from the points of a grid, over its neighbours in 16 directions; on the host.
-
-    Args:
-        map: one map; moving obstacles are left out.
-        cell: distance of neighbouring points [px]; at most half the thickness of walls grown by
-            the clearance, so that no way and no value leads through one.
-        clearance: distance to keep from obstacles [px]; the robot's radius by default.
-
-    Returns:
-        WayLength; lengths are up to 5 % longer than those of the planner.
-
-    Raises:
-        ValueError: `cell` is not positive.
-    """
-    require_positive("cell", cell, "give pixels; 10 suits walls of 18 pixels")
-    x0, y0, x1, y1 = np.asarray(map.bounds, np.float64)
-    columns, rows = (int(np.ceil((b - a) / cell)) + 1 for a, b in ((x0, x1), (y0, y1)))
-    xs, ys = x0 + cell * np.arange(columns), y0 + cell * np.arange(rows)
-    points = np.stack(np.meshgrid(xs, ys, indexing="ij"), axis=-1).reshape(-1, 2)
-    radius = float(map.robot_radius) if clearance is None else float(clearance)
-    free = (Obstacles.of(map).clearance(points, points) >= radius).reshape(columns, rows)
-    number = np.arange(columns * rows).reshape(columns, rows)
-    begin, end, length = [], [], []
-    for dx, dy in ((1, 0), (0, 1), (1, 1), (1, -1), (2, 1), (1, 2), (2, -1), (1, -2)):
-        low, high = max(0, -dy), rows - max(0, dy)
-        here = np.s_[: columns - dx, low:high]
-        there = np.s_[dx:, low + dy : high + dy]
-        both = free[here] & free[there]
-        begin.append(number[here][both])
-        end.append(number[there][both])
-        length.append(np.full(int(both.sum()), cell * np.hypot(dx, dy)))
-    size = columns * rows
-    edges = (np.concatenate(length), (np.concatenate(begin), np.concatenate(end)))
-    gap = np.hypot(*(points - np.asarray(map.target, np.float64)).T)
-    arrived = np.flatnonzero((gap <= float(map.arrival_radius)) & free.reshape(-1))
-    if not len(arrived):  # the circle lies between the points
-        arrived = np.flatnonzero(gap == gap[free.reshape(-1)].min())
-    ways = csgraph.dijkstra(
-        sparse.csr_matrix(edges, shape=(size, size)), directed=False, indices=arrived, min_only=True
-    )
-    grid = ways.reshape(columns, rows)
-    nearest = ndimage.distance_transform_edt(
-        ~np.isfinite(grid), return_distances=False, return_indices=True
-    )
-    return WayLength(
-        lengths=jnp.asarray(grid[tuple(nearest)], jnp.float32),
-        origin=jnp.asarray([x0, y0], jnp.float32),
-        cell=jnp.float32(cell),
-    )
-
-
 def remaining_way(way: WayLength, x: Float[Array, ""], y: Float[Array, ""]) -> Float[Array, ""]:
     """Length of the way from a position, bilinear between the points of the grid [px]."""
     columns, rows = way.lengths.shape
@@ -100,3 +39,33 @@ def remaining_way(way: WayLength, x: Float[Array, ""], y: Float[Array, ""]) -> F
     low = (1.0 - b) * way.lengths[i, j] + b * way.lengths[i, j + 1]
     high = (1.0 - b) * way.lengths[i + 1, j] + b * way.lengths[i + 1, j + 1]
     return (1.0 - a) * low + a * high
+
+
+def turn_onto_way(
+    way: WayLength,
+    x: Float[Array, ""],
+    y: Float[Array, ""],
+    heading: Float[Array, ""],
+    *,
+    reach: float = 15.0,
+) -> Float[Array, ""]:
+    r"""The turn after which a robot heads along the shortest way [deg], positive to the left.
+
+    .. math:: \beta = \operatorname{atan2}(u \times g,\, u \cdot g), \qquad g = -\nabla L(x, y)
+
+    with L the remaining way, its gradient by central differences over `reach` [px] on either side,
+    and u the unit heading; 0 where the way has no direction, as inside the arrival circle.
+
+    Example:
+        >>> grid = jnp.broadcast_to(jnp.arange(9.0)[:, None] * 10.0, (9, 9))
+        >>> way = WayLength(grid, jnp.zeros(2), jnp.float32(10.0))
+        >>> at = jnp.float32(40.0)
+        >>> round(float(turn_onto_way(way, at, at, jnp.float32(jnp.pi / 2))))
+        90
+    """
+    right, left = remaining_way(way, x + reach, y), remaining_way(way, x - reach, y)
+    above, below = remaining_way(way, x, y + reach), remaining_way(way, x, y - reach)
+    gx, gy = left - right, below - above
+    c, s = jnp.cos(heading), jnp.sin(heading)
+    turn = jnp.rad2deg(jnp.arctan2(c * gy - s * gx, c * gx + s * gy))
+    return jnp.where(jnp.hypot(gx, gy) > 1e-3 * reach, turn, 0.0)

@@ -28,6 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxsnn import geometry
 from jaxsnn._checks import require_key
+from jaxsnn.way import WayLength, turn_onto_way
 
 N_SONARS = 5
 
@@ -68,6 +69,7 @@ class WorldParams(NamedTuple):
     angle_noise: Array  # [] standard deviation [deg]
     sonar_failed: Array  # [5] bool: this sonar reports its stuck value
     sonar_stuck: Array  # [5] what a failed sonar reports [px]
+    way: WayLength | None = None  # shortest ways, for rewards alone; made by `ways.with_way`
 
 
 class WorldState(NamedTuple):
@@ -86,6 +88,8 @@ class Reading(NamedTuple):
     sonar: Array  # [5] distance to what each sonar sees, at most sonar_range [px]
     distance: Array  # [] distance to the target, at most distance_range [px]
     angle: Array  # [] angle from heading to target in (-180, 180], positive = to the left [deg]
+    # No sensor, and no network's input: what a trainer that knows the map tells a reward.
+    way_turn: Array | None = None  # [] turn onto the shortest way [deg]; None without `map.way`
 
 
 class Outcome(NamedTuple):
@@ -223,7 +227,10 @@ def observe(params: WorldParams, state: WorldState, *, others: Discs | None = No
     # Noise may carry the angle over the cut; -180 itself is written as 180.
     angle = jnp.where(angle <= -180.0, angle + 360.0, angle)
     angle = jnp.where(angle > 180.0, angle - 360.0, angle)
-    return Reading(ranges, distance, angle)
+    if params.way is None:
+        return Reading(ranges, distance, angle)
+    way_turn = turn_onto_way(params.way, state.x, state.y, state.heading)
+    return Reading(ranges, distance, angle, way_turn.astype(angle.dtype))
 
 
 def _heading_and_move(

@@ -9,7 +9,8 @@ on maps of its test split that nothing was tuned on, weights or table frozen. Me
 after the source's 20 learning trials (2,000 for Q-learning, about 10,000 for PPO, whose reward
 counts progress along the shortest way), `sr_testing_60_trials` with `--learn-trials 60`, and
 `path_ratio` of the trials that arrived. `S4` is the reading "tuned", `S4_literal` the source's,
-`S4_guided` the one with a graded reward. Networks use the seeds of the tables of record from 0 on.
+`S4_guided` the one with a graded reward, `S4_way` the one whose trainer knows the way, as PPO's.
+Networks use the seeds of the tables of record from 0 on.
 
 Rows go to `results/study_detour.json` as each one ends; one that is there already with as many
 seeds is skipped, so the study can be broken off and gone on with. Drivers take seconds, Q-learning
@@ -28,7 +29,10 @@ from snn_fusion_failure.runs.origin import check_recordable
 
 ROWS = ("Scenario 1", "Scenario 2", "Scenario 3", "D1", "D2", "D3", "held-out detour family")
 DRIVERS = ("blind", "reflex_60", "reflex_100")
-NETWORKS = ("S1", "S2", "S3", "S4", "S4_literal", "S4_guided", "S3_guided")
+NETWORKS = (
+    *("S1", "S2", "S3", "S4", "S4_literal", "S4_guided", "S3_guided"),
+    *("S1_way", "S2_way", "S3_way", "S4_way"),
+)
 LEARNERS = ("q_learning", "ppo")
 FAMILY = ROWS[-1]
 UNITS = {"path_ratio": "1"}
@@ -47,7 +51,7 @@ TITLE = "Drivers and learners on maps that need a detour"
 class Study:
     """Fill the table of detours."""
 
-    models: tuple[str, ...] = (*DRIVERS, *LEARNERS, "S4_guided", "S4", "S4_literal")
+    models: tuple[str, ...] = (*DRIVERS, *LEARNERS, "S4_way", "S4_guided", "S4", "S4_literal")
     rows: tuple[str, ...] = ROWS
     seeds: int = 16
     """Robots, or learners of Q-learning."""
@@ -153,12 +157,13 @@ def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
     from jaxsnn import agents, trials
     from jaxsnn.experiment import learning_circles, make_runner
     from jaxsnn.presets import preset
+    from jaxsnn.ways import training_map
 
     name, _, reading = model.partition("_")
     network, params = preset(name, reading or "tuned")
     scenario = int(row[-1]) if row != FAMILY else 1
     learn = make_runner(
-        network, train_map(row), n_learn=config.learn_trials, n_test=1,
+        network, training_map(network, train_map(row)), n_learn=config.learn_trials, n_test=1,
         max_steps=config.max_steps, block=config.block, keep_states=True,
         circles=learning_circles(scenario, config.learn_trials),
     )  # fmt: skip
@@ -211,12 +216,12 @@ def run_ppo(config: Study, model: str, row: str) -> dict[str, list[float]]:
     import jax
     import jax.numpy as jnp
 
-    from jaxsnn import learners, ppo, way
+    from jaxsnn import learners, ppo, ways
 
     sizes, map = ppo.PPOConfig(**PPO), train_map(row)
     params = jax.tree.map(jnp.float32, ppo.PPOParams(**PPO_PARAMS))
     weights = learners.ppo_policies(
-        sizes, params, map, way.way_length(map),
+        sizes, params, map, ways.way_length(map),
         keys=jax.random.split(jax.random.key(41), config.seeds), max_steps=config.max_steps,
     ).weights  # fmt: skip
 

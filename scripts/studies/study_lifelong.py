@@ -1,7 +1,7 @@
 """Learning that goes on: a sonar dies, the map changes, a motor weakens; plasticity on and off.
 
     python scripts/studies/study_lifelong.py --models blind reflex_60 reflex_100
-    python scripts/studies/study_lifelong.py --models S4_guided S4 --seeds 16
+    python scripts/studies/study_lifelong.py --models S4_way S4_guided --seeds 16
 
 A robot learns 20 trials on a map and is tested there with frozen weights (`sr_before`). Then
 something changes: `dead sonar`, the inner left sonar reports an obstacle at 20 px for ever (one
@@ -39,7 +39,7 @@ TITLE = "Learning that goes on after the world has changed"
 class Study:
     """Fill the table of changes."""
 
-    models: tuple[str, ...] = ("blind", "reflex_60", "reflex_100", "S4_guided", "S4")
+    models: tuple[str, ...] = ("blind", "reflex_60", "reflex_100", "S4_way", "S4_guided", "S4")
     rows: tuple[str, ...] = ROWS
     seeds: int = 16
     map: str = "S3"
@@ -99,10 +99,11 @@ def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
     from jaxsnn.experiment import phase_keys, seed_keys
     from jaxsnn.map_files import named_map
     from jaxsnn.trials import run_phase
+    from jaxsnn.ways import training_map
 
     name, _, reading = model.partition("_")
     network, params = preset(name, reading or "tuned")
-    before, n = named_map(config.map), config.trials
+    before, n = training_map(network, named_map(config.map)), config.trials
     changed = params._replace(right_motor=WEAK) if row == "weak motor" else params
     frozen = agents.snn_agent(network, plastic=False)
 
@@ -128,7 +129,8 @@ def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
 
     params, changed = (jax.tree.map(jnp.float32, p) for p in (params, changed))
     words = jax.random.key_data(seed_keys(range(config.seeds)))
-    rates = run(words, params, changed, before, changed_map(config, row, before))
+    after = training_map(network, changed_map(config, row, before))
+    rates = run(words, params, changed, before, after)
     return {m: (100.0 * r).tolist() for m, r in zip(METRICS, rates, strict=True)}
 
 

@@ -2,9 +2,10 @@
 
     python scripts/studies/study_snn.py --study readings --seeds 8 --scenario 2
     python scripts/studies/study_snn.py --study gamma --model S2 --seeds 8 --max-minutes 30
+    python scripts/studies/study_snn.py --study way --map detour/validation/0
 
-Every variant is a reading (`literal` or `tuned`) with a few changes, run over the same seeds
-on a training scenario; test maps and the seeds of the tables of record are never used. Rows go to
+Every variant is a reading with a few changes, run over the same seeds on a training scenario or a
+validation map; test maps and the seeds of the tables of record are never used. Rows go to
 `results/study_snn_STUDY.json` as each variant ends; a variant that is there already (same seeds) is
 skipped, so a study can be broken off and gone on with. About 3 CPU-seconds per seed and variant.
 """
@@ -57,6 +58,27 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     "goal": {
         f"tuned, goal {g} degrees": ("tuned", (f"reward.goal_angle={g}",)) for g in (30, 45, 60, 90)
     },
+    # For maps that need a detour: one part of the reading "way" at a time taken out or changed.
+    "way": {
+        "way": ("way", ()),
+        "way, half the learning rate": ("way", ("params.gamma=1.5e-4",)),
+        "way, twice the learning rate": ("way", ("params.gamma=6e-4",)),
+        "way, learning rate not annealed": ("way", ("params.anneal=1e9",)),
+        "way, one rate for each sensor": ("way", ("config.input_code=sensor",)),
+        "way, no recent turns among the inputs": ("way", ("config.turn_groups=false",)),
+        "way, shorter memory of turns": ("way", ("params.goal.memory=0.7",)),
+        "way, turns not cut off": ("way", ("params.max_turn=Infinity",)),
+        "way, no homeostasis": ("way", ("params.homeostasis=0",)),
+        "way, eligibility not centred": ("way", ("params.centring=0",)),
+        "way, no reward at collision and arrival": (
+            "way",
+            ("reward.collision=0", "reward.arrival=0"),
+        ),
+        "way, additive rule": ("way", ("config.rule=additive", "params.gamma=9e-4")),
+        "guided (rule of all sonars)": ("guided", ()),
+        "way, rewards by the nearest obstacle": ("way", ("config.guidance=nearest",)),
+        "tuned": ("tuned", ()),
+    },
     "tau_z": {
         f"tuned, tau_z {t:g} s": ("tuned", (f"stdp.tau_z={t}",)) for t in (0.01, 0.025, 0.1, 0.3)
     },
@@ -85,11 +107,13 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
 class Study:
     """Compare variants."""
 
-    study: Literal["readings", "gamma", "goal", "tau_z", "homeostasis", "rates", "window"] = (
-        "readings"
-    )
+    study: Literal[
+        "readings", "gamma", "goal", "tau_z", "homeostasis", "rates", "window", "way"
+    ] = "readings"
     model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
     scenario: Literal[1, 2, 3] = 1
+    map: str | None = None
+    """A validation map in place of the scenario, FAMILY/validation/NUMBER."""
     seeds: int = 8
     first_seed: int = 1000
     """Not among the seeds of the tables of record (0 to 63)."""
@@ -106,8 +130,13 @@ def main(config: Study) -> dict[str, Any]:
     """Run the variants that are missing; returns SR-testing by variant."""
     from jaxsnn import scenarios, scores
     from jaxsnn.experiment import learning_circles, make_runner
+    from jaxsnn.map_files import named_map
+    from jaxsnn.ways import training_map
 
-    variants, map = STUDIES[config.study], scenarios.scenario(config.scenario)
+    if config.map is not None and config.map.split("/")[1:2] == ["test"]:
+        raise ValueError(f"map={config.map!r}: expected a map of the split validation or train")
+    variants = STUDIES[config.study]
+    map = scenarios.scenario(config.scenario) if config.map is None else named_map(config.map)
     unknown = set(config.only) - set(variants)
     if unknown:
         raise ValueError(f"only={sorted(unknown)}: expected some of {sorted(variants)}; choose")
@@ -118,7 +147,8 @@ def main(config: Study) -> dict[str, Any]:
         for r in recorded(path)
         if r["metric"] == "sr_testing" and r["n"] >= config.seeds
     }
-    model = f"{config.model} scenario {config.scenario}"
+    model = f"{config.model} {config.map or f'scenario {config.scenario}'}"
+    circles = None if config.map else learning_circles(config.scenario, 20)
     done: dict[str, float] = {}
     runners: dict[Any, Any] = {}
     start = time.process_time()
@@ -130,8 +160,8 @@ def main(config: Study) -> dict[str, Any]:
         built, params = changed_preset(config.model, reading, changes)
         if built not in runners:
             runners[built] = make_runner(
-                built, map, n_learn=20, n_test=config.test_trials, max_steps=config.max_steps,
-                block=config.block, circles=learning_circles(config.scenario, 20),
+                built, training_map(built, map), n_learn=20, n_test=config.test_trials,
+                max_steps=config.max_steps, block=config.block, circles=circles,
             )  # fmt: skip
         numbers = list(range(config.first_seed, config.first_seed + config.seeds))
         experiment = runners[built](numbers, params)

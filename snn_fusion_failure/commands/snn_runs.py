@@ -13,6 +13,7 @@ from snn_fusion_failure.runs import progress, write_json
 from snn_fusion_failure.runs.networks import changed_preset
 
 N_LEARN = 20
+Reading = Literal["tuned", "literal", "guided", "way"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -25,7 +26,7 @@ class Config:
     """Another map: a JSON file, D1 to D3, or FAMILY/SPLIT/NUMBER such as detour/train/0."""
     model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
     """Network and learning rule (Table 2.2 of the source)."""
-    reading: Annotated[Literal["tuned", "literal", "guided"], arg(aliases=["--setting"])] = "tuned"
+    reading: Annotated[Reading, arg(aliases=["--setting"])] = "tuned"
     """Readings and options, see docs/snn_networks.md."""
     seeds: int = 64
     """Independent runs."""
@@ -69,12 +70,13 @@ def run_seeds(
 
     from jaxsnn import scores
     from jaxsnn.experiment import learning_circles, make_runner
+    from jaxsnn.ways import training_map
 
     network, params = changed_preset(config.model, config.reading, config.changes)
     circles = None if config.map else learning_circles(config.scenario, config.learn_trials)
     run = make_runner(
-        network, map, n_learn=config.learn_trials, n_test=n_test, n_online=config.online_trials,
-        max_steps=config.max_steps, block=config.block,
+        network, training_map(network, map), n_learn=config.learn_trials, n_test=n_test,
+        n_online=config.online_trials, max_steps=config.max_steps, block=config.block,
         circles=circles, record=config.figures, keep_states=config.save is not None,
     )  # fmt: skip
     states = first_networks(config, network, params, n_seeds)

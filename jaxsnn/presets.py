@@ -81,6 +81,8 @@ READINGS["guided"] = {
 READINGS["way"] = {
     **READINGS["guided"],
     "config": {**READINGS["guided"]["config"], "guidance": "way"},
+    # Twice that of "guided": chosen on validation maps (results/study_snn_way.json).
+    "params": {**READINGS["guided"]["params"], "gamma": 3e-4},
 }
 # Learning rates relative to that of S4. The additive rule moves a weight by mV and the
 # multiplicative one by a fraction, and inputs of S1 and S2 fire at 0.4 times the rate. "tuned":

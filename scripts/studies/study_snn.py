@@ -61,8 +61,6 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     # For maps that need a detour: one part of the reading "way" at a time taken out or changed.
     "way": {
         "way": ("way", ()),
-        "way, half the learning rate": ("way", ("params.gamma=1.5e-4",)),
-        "way, twice the learning rate": ("way", ("params.gamma=6e-4",)),
         "way, learning rate not annealed": ("way", ("params.anneal=1e9",)),
         "way, one rate for each sensor": ("way", ("config.input_code=sensor",)),
         "way, no recent turns among the inputs": ("way", ("config.turn_groups=false",)),
@@ -74,10 +72,13 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
             "way",
             ("reward.collision=0", "reward.arrival=0"),
         ),
-        "way, additive rule": ("way", ("config.rule=additive", "params.gamma=9e-4")),
         "guided (rule of all sonars)": ("guided", ()),
         "way, rewards by the nearest obstacle": ("way", ("config.guidance=nearest",)),
         "tuned": ("tuned", ()),
+    },
+    "way_gamma": {
+        f"way, gamma {g:g}": ("way", (f"params.gamma={g}",))
+        for g in (1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 4.8e-3)
     },
     "tau_z": {
         f"tuned, tau_z {t:g} s": ("tuned", (f"stdp.tau_z={t}",)) for t in (0.01, 0.025, 0.1, 0.3)
@@ -108,7 +109,7 @@ class Study:
     """Compare variants."""
 
     study: Literal[
-        "readings", "gamma", "goal", "tau_z", "homeostasis", "rates", "window", "way"
+        "readings", "gamma", "goal", "tau_z", "homeostasis", "rates", "window", "way", "way_gamma"
     ] = "readings"
     model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
     scenario: Literal[1, 2, 3] = 1

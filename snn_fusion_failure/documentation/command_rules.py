@@ -85,6 +85,11 @@ RULES = (
         f"{_ROBOT} --test-trials 1 --only tuned",
         forget="results/study_snn_readings.json",
     ),
+    Rule(
+        "study_snn.py way",
+        f"{_ROBOT} --test-trials 1 --only tuned",
+        forget="results/study_snn_way.json",
+    ),
     Rule("figures_snn.py", "--scenarios 1"),
     Rule("compare_snn.py"),
     Rule(

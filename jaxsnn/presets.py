@@ -81,7 +81,7 @@ READINGS["guided"] = {
 READINGS["way"] = {
     **READINGS["guided"],
     "config": {**READINGS["guided"]["config"], "guidance": "way"},
-    # Twice that of "guided": chosen on validation maps (results/study_snn_way.json).
+    # Twice that of "guided": chosen on validation maps (results/study_snn_way_gamma.json).
     "params": {**READINGS["guided"]["params"], "gamma": 3e-4},
 }
 # Learning rates relative to that of S4. The additive rule moves a weight by mV and the

@@ -1,12 +1,15 @@
-"""Reversible network: coupling blocks in a scan, an exact inverse, a constant-memory gradient."""
+"""Reversible network of Equation 4.4: dense drives in the coupling of `fusion.reversible`."""
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
+
+from fusion.reversible.coupling import Coupling, couple, couple_stored, uncouple
 
 
 class RevNetParams(NamedTuple):
@@ -74,16 +77,18 @@ def _drive(k: Array, b: Array, x: Array, size: int) -> Array:
     return (hidden @ k)[..., :size]
 
 
-def _block(block: RevNetParams, u: Array, v: Array) -> tuple[Array, Array]:
-    u = u + block.step * _drive(block.k1, block.b1, v, u.shape[-1])
-    v = v - block.step * _drive(block.k2, block.b2, u, v.shape[-1])
-    return u, v
+def _drive_u(size: int, block: RevNetParams, v: Array) -> Array:
+    return block.step * _drive(block.k1, block.b1, v, size)
 
 
-def _unblock(block: RevNetParams, u: Array, v: Array) -> tuple[Array, Array]:
-    v = v + block.step * _drive(block.k2, block.b2, u, v.shape[-1])
-    u = u - block.step * _drive(block.k1, block.b1, v, u.shape[-1])
-    return u, v
+def _drive_v(size: int, block: RevNetParams, u: Array) -> Array:
+    return -(block.step * _drive(block.k2, block.b2, u, size))
+
+
+def _coupling(params: RevNetParams, x: Array) -> Coupling:
+    """What the blocks add to halves of the sizes that the input is split into."""
+    m = params.k1.shape[-1]
+    return Coupling(functools.partial(_drive_u, m), functools.partial(_drive_v, x.shape[-1] - m))
 
 
 def _split(params: RevNetParams, x: Array) -> tuple[Array, Array]:
@@ -99,11 +104,10 @@ def _split(params: RevNetParams, x: Array) -> tuple[Array, Array]:
 
 def forward_stored(params: RevNetParams, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
     """`forward` with JAX's own reverse rule, which stores every block's activations."""
-    (u, v), _ = jax.lax.scan(lambda c, block: (_block(block, *c), None), _split(params, x), params)
-    return jnp.concatenate([u, v], -1)
+    halves = couple_stored(_coupling(params, x), params, *_split(params, x))
+    return jnp.concatenate(halves, -1)
 
 
-@jax.custom_vjp
 def forward(params: RevNetParams, x: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
     r"""Map inputs to features, :math:`z = g(x)`.
 
@@ -132,7 +136,8 @@ def forward(params: RevNetParams, x: Float[Array, "*b d"]) -> Float[Array, "*b d
         >>> bool(jnp.allclose(inverse(params, forward(params, x)), x, atol=1e-5))
         True
     """
-    return forward_stored(params, x)
+    halves = couple(_coupling(params, x), params, *_split(params, x))
+    return jnp.concatenate(halves, -1)
 
 
 def inverse(params: RevNetParams, z: Float[Array, "*b d"]) -> Float[Array, "*b d"]:
@@ -140,32 +145,5 @@ def inverse(params: RevNetParams, z: Float[Array, "*b d"]) -> Float[Array, "*b d
 
     Source: Shim (2020), Eq. 4.5.
     """
-    (u, v), _ = jax.lax.scan(
-        lambda c, block: (_unblock(block, *c), None), _split(params, z), params, reverse=True
-    )
-    return jnp.concatenate([u, v], -1)
-
-
-def _forward_rule(params: RevNetParams, x: Array) -> tuple[Array, tuple[RevNetParams, Array]]:
-    z = forward_stored(params, x)
-    return z, (params, z)
-
-
-def _backward_rule(kept: tuple[RevNetParams, Array], grad_z: Array) -> tuple[RevNetParams, Array]:
-    params, z = kept
-
-    def undo(
-        carry: tuple[Array, Array, Array, Array], block: RevNetParams
-    ) -> tuple[tuple[Array, Array, Array, Array], RevNetParams]:
-        u, v, grad_u, grad_v = carry
-        u, v = _unblock(block, u, v)
-        _, pull = jax.vjp(_block, block, u, v)
-        grad_block, grad_u, grad_v = pull((grad_u, grad_v))
-        return (u, v, grad_u, grad_v), grad_block
-
-    start = (*_split(params, z), *_split(params, grad_z))
-    (_, _, grad_u, grad_v), grads = jax.lax.scan(undo, start, params, reverse=True)
-    return grads, jnp.concatenate([grad_u, grad_v], -1)
-
-
-forward.defvjp(_forward_rule, _backward_rule)
+    halves = uncouple(_coupling(params, z), params, *_split(params, z))
+    return jnp.concatenate(halves, -1)

@@ -1,8 +1,6 @@
 """Unisensory encoders: one small network per sensor, all of them computed as one batched matmul.
 
-Every array has the sensor (branch) axis first, `[branch, batch, ...]`: the K encoders are then a
-single batched matrix product, which on a CPU is several times faster than K convolutions, and many
-times faster inside `jax.lax.scan`, where XLA's CPU convolution is slow.
+Every array has the sensor (branch) axis first, `[branch, batch, ...]`, see `fusion.stacked`.
 """
 
 from __future__ import annotations
@@ -13,19 +11,20 @@ import math
 from typing import Literal, get_args
 
 import flax.linen as nn
-import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
 from fusion._checks import check_choice, check_count, check_counts, check_type
-from fusion.spectrum import spectral_features
+from fusion.reversible.config import ReversibleConfig
+from fusion.reversible.encoder import ReversibleEncoder
+from fusion.series_readout import pooled_features
 from fusion.spiking.config import SpikingConfig
 from fusion.spiking.encoder import SpikingEncoder
+from fusion.stacked import Backend, conv1d, he_normal, stacked_dense
 from fusion.tables import TableEncoder
 
-Backend = Literal["matmul", "conv"]
-SeriesKind = Literal["conv", "spiking"]
+SeriesKind = Literal["conv", "spiking", "reversible"]
 ScalarKind = Literal["fourier", "table"]
 
 
@@ -49,8 +48,10 @@ class EncoderConfig:
         known_readings: a table gives a token of its own for readings that are no level.
         backend: how `conv1d` is computed; `"matmul"` for CPU, `"conv"` for accelerators.
         series: what encodes a sensor, `"conv"` the convolutions and Fourier features above,
-            `"spiking"` the neurons of `spiking`, for series and for scalars.
+            `"spiking"` the neurons of `spiking`, `"reversible"` the stages of `reversible`, both
+            for series and for scalars.
         spiking: code, layers and neurons of the spiking encoders.
+        reversible: stages of the reversible encoders.
 
     Raises:
         ValueError: sizes that cannot be built, or readings that are not sorted.
@@ -69,6 +70,7 @@ class EncoderConfig:
     backend: Backend | str = "matmul"
     series: SeriesKind | str = "conv"
     spiking: SpikingConfig = dataclasses.field(default_factory=SpikingConfig)
+    reversible: ReversibleConfig = dataclasses.field(default_factory=ReversibleConfig)
 
     def __post_init__(self) -> None:
         """Refuse sizes that cannot be built."""
@@ -80,6 +82,7 @@ class EncoderConfig:
         check_choice("backend", self.backend, get_args(Backend))
         check_choice("series", self.series, get_args(SeriesKind))
         check_type("spiking", self.spiking, SpikingConfig, "build a SpikingConfig")
+        check_type("reversible", self.reversible, ReversibleConfig, "build a ReversibleConfig")
         for k, row in enumerate(self.levels):
             if not row or not all(math.isfinite(v) for v in row) or sorted(set(row)) != list(row):
                 raise ValueError(
@@ -110,75 +113,6 @@ class EncoderConfig:
         return self.series == "spiking" and self.spiking.learning == "reward_stdp"
 
 
-def conv1d(
-    x: Float[Array, "k b t c"],
-    kernel: Float[Array, "k w c f"],
-    bias: Float[Array, "k f"],
-    *,
-    stride: int = 1,
-    backend: Backend | str = "matmul",
-) -> Float[Array, "k b t2 f"]:
-    r"""K independent one-dimensional convolutions, without padding.
-
-    .. math:: y_{k,b,i,f} = b_{k,f} + \sum_{j,c} x_{k,b,is+j,c}\, W_{k,j,c,f}
-
-    Args:
-        x: K batches of series, `[branch, batch, time, channel]`.
-        kernel: `[branch, width, channel, feature]`.
-        bias: `[branch, feature]`.
-        stride: step s between outputs, in samples.
-        backend: `"matmul"` gathers the windows and multiplies (fast inside `scan` on a CPU);
-            `"conv"` calls XLA's grouped convolution. Both give the same numbers to rounding.
-
-    Returns:
-        `[branch, batch, (time - width) // stride + 1, feature]`.
-    """
-    check_choice("backend", backend, get_args(Backend))
-    check_count("stride", stride)
-    k, b, t, c = x.shape
-    _, w, _, f = kernel.shape
-    if t < w:
-        raise ValueError(
-            f"x.shape={tuple(x.shape)}: expected at least {w} samples, the width of the kernel; "
-            "use longer windows or a smaller kernel"
-        )
-    n = (t - w) // stride + 1
-    if backend == "matmul":
-        windows = [
-            jax.lax.slice_in_dim(x, j, j + (n - 1) * stride + 1, stride, 2) for j in range(w)
-        ]
-        columns = jnp.concatenate(windows, axis=-1).reshape(k, b * n, w * c)
-        y = columns @ kernel.reshape(k, w * c, f)
-        return y.reshape(k, b, n, f) + bias[:, None, None, :]
-    grouped = jnp.transpose(x, (1, 2, 0, 3)).reshape(b, t, k * c)
-    kernels = jnp.transpose(kernel, (1, 2, 0, 3)).reshape(w, c, k * f)
-    y = jax.lax.conv_general_dilated(
-        grouped,
-        kernels,
-        (stride,),
-        "VALID",
-        dimension_numbers=("NWC", "WIO", "NWC"),
-        feature_group_count=k,
-    )
-    return jnp.transpose(y.reshape(b, n, k, f), (2, 0, 1, 3)) + bias[:, None, None, :]
-
-
-def _he(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
-    """He-normal weights for stacked layers: the fan-in leaves out branch and output axes."""
-    fan_in = math.prod(shape[1:-1])
-    return jax.random.normal(key, shape, dtype) * jnp.asarray(math.sqrt(2.0 / fan_in), dtype)
-
-
-def stacked_dense(
-    module: nn.Module, name: str, x: Float[Array, "k b i"], features: int, scale: float = 1.0
-) -> Float[Array, "k b f"]:
-    """A dense layer per branch with parameters `name_kernel` and `name_bias` of `module`."""
-    k, _, i = x.shape
-    kernel = module.param(f"{name}_kernel", lambda key: scale * _he(key, (k, i, features)))
-    bias = module.param(f"{name}_bias", nn.initializers.zeros, (k, features))
-    return x @ kernel + bias[:, None, :]
-
-
 class SeriesEncoder(nn.Module):
     """Encode windows of K sensors: two strided convolutions beside a log-spectrum path.
 
@@ -197,16 +131,11 @@ class SeriesEncoder(nn.Module):
         for layer in range(2):
             width, features = config.conv_kernels[layer], config.conv_features[layer]
             shape = (k, width, h.shape[-1], features)
-            kernel = self.param(f"conv{layer}_kernel", _he, shape)
+            kernel = self.param(f"conv{layer}_kernel", he_normal, shape)
             bias = self.param(f"conv{layer}_bias", nn.initializers.zeros, (k, features))
             stride = config.conv_strides[layer]
             h = nn.relu(conv1d(h, kernel, bias, stride=stride, backend=config.backend))
-        h = jnp.concatenate([jnp.mean(h, axis=2), jnp.max(h, axis=2)], axis=-1)
-        paths = [nn.relu(stacked_dense(self, "conv_out", h, config.features))]
-        if config.spectral:
-            spectrum = stacked_dense(self, "spectral", spectral_features(x), config.features)
-            paths.append(nn.relu(spectrum))
-        return nn.relu(stacked_dense(self, "out", jnp.concatenate(paths, -1), config.features))
+        return pooled_features(self, h, x, config.features, spectral=config.spectral)
 
 
 def readings_recur(x: Float[np.ndarray, "n k 1"]) -> bool:
@@ -281,6 +210,16 @@ def encoder(config: EncoderConfig, n_times: int, name: str) -> nn.Module:
                 "strides of all spiking layers; change spiking.strides or cut the windows"
             )
         return SpikingEncoder(config.spiking, functools.partial(scalar_features, config), name=name)
+    if config.series == "reversible":
+        if n_times % config.reversible.squeeze:
+            raise ValueError(
+                f"n_times={n_times}: expected a multiple of {config.reversible.squeeze} samples, "
+                "the squeezes of all reversible stages; change reversible.squeezes or cut the "
+                "windows"
+            )
+        expand = functools.partial(scalar_features, config)
+        sizes = config.reversible, config.features, config.spectral, expand
+        return ReversibleEncoder(*sizes, name=name)
     shortest = config.conv_kernels[0] + config.conv_strides[0] * (config.conv_kernels[1] - 1)
     if n_times == 1 and config.scalar == "table":
         if not config.levels:

@@ -17,7 +17,7 @@ from jaxtyping import Array, Bool, Float, Key
 from fusion._checks import check_key
 from fusion.bayesian_gate import VariationalGate
 from fusion.config import ModelConfig
-from fusion.encoders import encoder, stacked_dense
+from fusion.encoders import encoder
 from fusion.gating import (
     Gate,
     apply_weights,
@@ -27,6 +27,7 @@ from fusion.gating import (
     oracle_weights,
 )
 from fusion.neighbours import EPSILON, Memory, neighbour_probabilities, read_memory
+from fusion.stacked import stacked_dense
 from fusion.tables import TableEncoder
 from fusion.targets import init_targets
 

@@ -10,6 +10,7 @@ from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import Dataset
 from fusion.encoders import EncoderConfig, SeriesKind, reading_levels, readings_recur
 from fusion.losses import LossParams
+from fusion.reversible.config import ReversibleConfig
 from fusion.sizes import match_parameters
 from fusion.spiking.config import SpikingConfig
 from fusion.tables import BINS, reading_ranks
@@ -96,6 +97,10 @@ ENCODED: dict[str, tuple[str, str]] = {
     "spiking_netgated": ("netgated", "spiking"),
     "spiking_argate_plus": ("argate_plus", "spiking"),
     "spiking_argate": ("argate_l", "spiking"),
+    "rev_conv_baseline": ("baseline", "reversible"),
+    "rev_conv_netgated": ("netgated", "reversible"),
+    "rev_conv_argate_plus": ("argate_plus", "reversible"),
+    "rev_conv_argate": ("argate_l", "reversible"),
 }
 """Names of a recipe with an encoder; any other pair is had by `encoder`."""
 
@@ -117,7 +122,28 @@ _SPIKING: dict[str, tuple[SpikingConfig, dict[str, Any], dict[str, Any]]] = {
     ),
     "own": (SpikingConfig(widths=(16, 32), taps=(4, 4), strides=(1, 1)), {}, {}),
 }
-_SPIKING_RATE = {"har": 5e-3}
+# Stages of the reversible encoders; chosen on validation rows, see docs/reversible_fusion.md. A
+# scalar has nothing to squeeze; it enters by its octaves.
+_REVERSIBLE: dict[str, tuple[ReversibleConfig, dict[str, Any], dict[str, Any]]] = {
+    "har": (ReversibleConfig(), {}, {}),
+    "driver": (
+        ReversibleConfig(squeezes=(1,), channels=24, depths=(2,), hidden=(24,), taps=(1,)),
+        {},
+        {},
+    ),
+    "simulated": (ReversibleConfig(hidden=(8, 16), taps=(3, 3)), {}, {}),
+    "own": (
+        ReversibleConfig(squeezes=(1,), channels=8, depths=(4,), hidden=(16,), taps=(5,)),
+        {},
+        {},
+    ),
+}
+_BY_ENCODER: dict[str, dict[str, tuple[Any, dict[str, Any], dict[str, Any]]]] = {
+    "spiking": dict(_SPIKING),
+    "reversible": dict(_REVERSIBLE),
+}
+"""Encoder -> data set -> its config, changed sizes of the network, changed training."""
+_RATE = {("har", "spiking"): 5e-3}
 """Learning rates where they are not those of the data set's preset."""
 
 
@@ -147,9 +173,10 @@ def _with_encoder(base: Preset, dataset: Dataset, encoder: str) -> Preset:
     """The preset with another encoder, and with the sizes that go with it."""
     if encoder == "conv":
         return base
-    spiking, sizes, training = _SPIKING[dataset.name]
-    series = dataclasses.replace(base.model.encoder, series=encoder, spiking=spiking)
-    rate = _SPIKING_RATE.get(dataset.name, base.hyper.learning_rate)
+    own, sizes, training = _BY_ENCODER[encoder][dataset.name]
+    changed: dict[str, Any] = {"series": encoder, encoder: own}
+    series = dataclasses.replace(base.model.encoder, **changed)
+    rate = _RATE.get((dataset.name, encoder), base.hyper.learning_rate)
     return Preset(
         dataclasses.replace(base.model, encoder=series, **sizes),
         dataclasses.replace(base.train, **training),
@@ -173,7 +200,7 @@ def preset(
         name: `"paper"` for the record, `"quick"` for the same with few epochs.
         head: `"dense"`; for the driver data also `"neighbourhood"` (its default), which compares
             with training rows, and `"embedding"`, the same encoders without them.
-        encoder: `"conv"` or `"spiking"`; that of the model's name when None.
+        encoder: `"conv"`, `"spiking"` or `"reversible"`; that of the model's name when None.
 
     Returns:
         Model, training and hyper-parameters; change fields with `dataclasses.replace` and

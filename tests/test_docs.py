@@ -45,7 +45,7 @@ def blocks(page: Path) -> list[tuple[bool, str, int]]:
 # These compile or train for twenty seconds and more each.
 LONG = (
     "bayesian_gate", "argate_in_flax", "own_data", "brax_ppo", "lattice_in_flax", "swap_reward",
-    "spiking_encoder",
+    "spiking_encoder", "reversible_encoder",
 )  # fmt: skip
 
 

@@ -54,15 +54,19 @@ class Cost(NamedTuple):
 
 
 def _series(config: EncoderConfig, n_times: int, *, fast: bool) -> float:
-    """Multiply-adds of one sensor's convolutions and spectrum."""
+    """Multiply-adds of one sensor's convolutions and what is read of them."""
     total, length, channels = 0.0, n_times, 1
     layers = zip(config.conv_kernels, config.conv_strides, config.conv_features, strict=True)
     for width, stride, features in layers:
         length = (length - width) // stride + 1
         total += length * width * channels * features
         channels = features
-    total += 2 * channels * config.features
-    joined = config.features
+    return total + _readout(config, n_times, channels, fast=fast)
+
+
+def _readout(config: EncoderConfig, n_times: int, channels: int, *, fast: bool) -> float:
+    """Multiply-adds of one sensor's `pooled_features`."""
+    total, joined = float(2 * channels * config.features), config.features
     if config.spectral:
         bins = n_times // 2
         # A real FFT of N samples has about N log2 N multiplications; as a matrix it has 2 N bins.
@@ -70,6 +74,19 @@ def _series(config: EncoderConfig, n_times: int, *, fast: bool) -> float:
         total += (bins + 7) * config.features
         joined += config.features
     return total + joined * config.features
+
+
+def _reversible(config: EncoderConfig, n_times: int, *, fast: bool) -> float:
+    """Multiply-adds of one sensor's coupling blocks and what is read of them."""
+    trunk = config.reversible
+    widths, total, length = trunk.stage_channels(), 0.0, n_times
+    for stage, half in enumerate(width // 2 for width in widths):
+        length //= trunk.squeezes[stage]
+        drive = (trunk.taps[stage] + 1) * half * trunk.hidden[stage]
+        total += trunk.depths[stage] * 2 * length * drive
+    if n_times == 1:
+        return total + widths[-1] * config.features
+    return total + _readout(config, n_times, widths[-1], fast=fast)
 
 
 def _spiking(config: EncoderConfig, n_times: int) -> float:
@@ -119,6 +136,8 @@ def multiply_adds(config: ModelConfig, *, fast: bool = False) -> dict[str, float
         )
     if encoder.series == "spiking":
         own = _spiking(encoder, config.n_times)
+    elif encoder.series == "reversible":
+        own = _reversible(encoder, config.n_times, fast=fast)
     elif config.n_times == 1:
         own = float(_scalar_channels(encoder) * encoder.features)
     else:

@@ -32,9 +32,10 @@ class Config:
     """Your own windows instead: .npz with x, y and optional groups, channels, classes."""
     model: str = "argate_l"
     """baseline, netgated, argate_ws, argate_plus, argate_l; *_printed (to the letter); or
-    equal_weights, modality_dropout, embracenet, oracle; spiking_argate and others of spiking_*."""
+    equal_weights, modality_dropout, embracenet, oracle; spiking_argate and others of spiking_*;
+    rev_conv_argate and others of rev_conv_* (reversible encoders)."""
     encoder: str | None = None
-    """conv or spiking, for any model; the model's own when left out."""
+    """conv, spiking or reversible, for any model; the model's own when left out."""
     head: str | None = None
     """dense; for driver also neighbourhood (its default) and embedding."""
     gate: Literal["deterministic", "bayesian", "bayesian_whole"] = "deterministic"

@@ -107,7 +107,7 @@ def draw(graph: imports.Graph) -> str:
             if other != room and (room, other) in arrows:
                 end = PLACES[other][0] + PLACES[other][2]
                 canvas.line((x, 590), (end, 590), arrow=True, width=2)
-    canvas.text(635, 628, "the one arrow between them: failure.rev_argate uses fusion", size=11,
+    canvas.text(635, 628, "failure.rev_argate and failure.revnet use fusion", size=11,
                 colour=SOFT)  # fmt: skip
     return canvas.render()
 

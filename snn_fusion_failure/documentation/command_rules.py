@@ -118,6 +118,15 @@ RULES = (
         "study_spiking_fusion.py",
         "--preset quick --seeds 1 --models spiking_netgated --rows clean --results runs",
     ),
+    Rule("study_rev_conv.py memory", "--depths 2 4 --results runs"),
+    Rule(
+        "study_rev_conv.py restoration",
+        "--preset quick --seeds 1 --sensors body_acc_x --results runs",
+    ),
+    Rule(
+        "study_rev_conv.py",
+        "--preset quick --seeds 1 --models rev_conv_baseline --rows clean --results runs",
+    ),
     Rule(
         "study_bayesian_gate.py",
         "--preset quick --seeds 1 --networks argate_l bayesian --train-only",
@@ -250,7 +259,8 @@ AREAS = {
     "sweeps": ("sweep", "bench_sweep"),
     "fusion": (
         "train_argate", "watch_sensors", "study_argate", "study_sensors", "bench_fusion",
-        "study_spiking_fusion", "study_bayesian_gate", "bench_lattice", "reproduce",
+        "study_spiking_fusion", "study_rev_conv", "study_bayesian_gate", "bench_lattice",
+        "reproduce",
     ),
     "circuits": (
         "find_failures", "study_failures", "study_active", "study_circuits", "study_parity",

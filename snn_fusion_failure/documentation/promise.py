@@ -28,6 +28,8 @@ BY_PATH = {
     "fusion.modules": "ARGate and its loss around flax modules of one's own",
     "fusion.targets": "what ARGate-L learns its targets with",
     "fusion.plots": "pictures (matplotlib)",
+    "fusion.reversible.blocks": "reversible trunks of series and images, and their inverse",
+    "fusion.reversible.restoration": "windows of a failed sensor out of those of the others",
     "fusion.spiking.config": "neurons, codes and layers of spiking encoders",
     "fusion.spiking.encoder": "spiking encoders of whole windows",
     "fusion.spiking.layers": "spiking layers that are fed piece by piece",

@@ -9,7 +9,7 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from failure import bayesian_linear, bnn, revnet
+from failure import bnn, revnet
 from failure.circuits.buck import cycle
 from failure.circuits.solver import mosfet
 from failure.models import acquisition, domains, gp, gp_fit
@@ -195,14 +195,6 @@ CASES = [
             BNN, BNN_TRAIN, bnn.init(k, BNN, BNN_TRAIN, x, y), x, y, key=k
         ),
         lambda rng: (key(rng), rng.normal(size=(6, 2)), rng.normal(size=(6, 3))),
-        (2,),
-    ),
-    Case(
-        "bayesian_linear.predict_linear",
-        lambda x, y, new: bayesian_linear.predict_linear(
-            bayesian_linear.fit_linear(x, y, iterations=3), new
-        )[0],
-        normal((8, 2), (8, 3), (4, 2)),
         (2,),
     ),
 ]

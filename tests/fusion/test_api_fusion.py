@@ -10,7 +10,15 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion import encoders, failure_kinds, failures, gating, losses, targets
+from fusion import (
+    bayesian_linear,
+    failure_kinds,
+    failures,
+    gating,
+    losses,
+    stacked,
+    targets,
+)
 from fusion.detection.geometry import encodings, overlaps, suppression
 from fusion.detection.learning import detection_loss
 from fusion.detection.network import crop
@@ -211,8 +219,16 @@ CASES = [
         lambda rng: f32(rng.uniform(0.1, 3.0, (4, 2))),
     ),
     Case(
-        "encoders.conv1d",
-        lambda x, w, b: encoders.conv1d(x, w, b, stride=2),
+        "bayesian_linear.predict_linear",
+        lambda x, y, new: bayesian_linear.predict_linear(
+            bayesian_linear.fit_linear(x, y, iterations=3), new
+        )[0],
+        normal((8, 2), (8, 3), (4, 2)),
+        (2,),
+    ),
+    Case(
+        "stacked.conv1d",
+        lambda x, w, b: stacked.conv1d(x, w, b, stride=2),
         normal((2, 3, 8, 2), (2, 3, 2, 4), (2, 4)),
         (0, 1, 2),
     ),

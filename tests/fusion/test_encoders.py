@@ -12,11 +12,11 @@ from hypothesis import strategies as st
 
 from fusion.encoders import (
     EncoderConfig,
-    conv1d,
     encoder,
     reading_levels,
-    spectral_features,
 )
+from fusion.spectrum import spectral_features
+from fusion.stacked import conv1d
 
 
 def _draw(seed: int, *shape: int) -> np.ndarray:

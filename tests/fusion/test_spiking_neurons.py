@@ -12,12 +12,12 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from fusion.encoders import conv1d
 from fusion.spiking.codes import code_start, encode
 from fusion.spiking.config import SpikingConfig
 from fusion.spiking.layers import gather
 from fusion.spiking.neurons import NeuronParams, neuron_step, rest, spread_leaks
 from fusion.spiking.surrogate import spike, surrogate_slope
+from fusion.stacked import conv1d
 from jaxsnn.neurons import LIFParams, lif_init, lif_step
 
 GOLDEN = Path(__file__).resolve().parent.parent / "golden"

@@ -1,4 +1,4 @@
-"""Bayesian linear regression with several outputs, the reference of the restoration network."""
+"""Bayesian linear regression with several outputs: a conditional density in closed form."""
 
 from __future__ import annotations
 
@@ -7,8 +7,6 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int, Key
-
-from failure.bnn import check_rows
 
 
 class LinearPosterior(NamedTuple):
@@ -43,9 +41,16 @@ def fit_linear(
         prior_variance: :math:`\tau^2`.
         iterations: updates of :math:`\sigma^2` by MacKay's effective number of parameters.
 
+    Raises:
+        ValueError: rows of `x` and `y` differ, or fewer than 2.
+
     Source: Bishop (2006), Equations 3.53, 3.54 and 3.95.
     """
-    check_rows(x, y)
+    if x.shape[0] != y.shape[0] or x.shape[0] < 2:
+        raise ValueError(
+            f"y.shape[0]={y.shape[0]}: expected the {x.shape[0]} rows of x, at least 2; give one "
+            "target for each input"
+        )
     phi = _design(x)
     n = phi.shape[0]
     gram, cross = phi.T @ phi, phi.T @ y

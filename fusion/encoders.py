@@ -21,7 +21,7 @@ from fusion.reversible.encoder import ReversibleEncoder
 from fusion.series_readout import pooled_features
 from fusion.spiking.config import SpikingConfig
 from fusion.spiking.encoder import SpikingEncoder
-from fusion.stacked import Backend, conv1d, he_normal, stacked_dense
+from fusion.stacked import Backend, conv1d, he_init, stacked_dense
 from fusion.tables import TableEncoder
 
 SeriesKind = Literal["conv", "spiking", "reversible"]
@@ -131,7 +131,7 @@ class SeriesEncoder(nn.Module):
         for layer in range(2):
             width, features = config.conv_kernels[layer], config.conv_features[layer]
             shape = (k, width, h.shape[-1], features)
-            kernel = self.param(f"conv{layer}_kernel", he_normal, shape)
+            kernel = self.param(f"conv{layer}_kernel", he_init, shape)
             bias = self.param(f"conv{layer}_bias", nn.initializers.zeros, (k, features))
             stride = config.conv_strides[layer]
             h = nn.relu(conv1d(h, kernel, bias, stride=stride, backend=config.backend))

@@ -73,7 +73,7 @@ def conv1d(
     return jnp.transpose(y.reshape(b, n, k, f), (2, 0, 1, 3)) + bias[:, None, None, :]
 
 
-def he_normal(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
+def he_init(key: Array, shape: tuple[int, ...], dtype: jnp.dtype = jnp.float32) -> Array:
     """He-normal weights for stacked layers: the fan-in leaves out branch and output axes."""
     fan_in = math.prod(shape[1:-1])
     return jax.random.normal(key, shape, dtype) * jnp.asarray(math.sqrt(2.0 / fan_in), dtype)
@@ -84,6 +84,6 @@ def stacked_dense(
 ) -> Float[Array, "k b f"]:
     """A dense layer per branch with parameters `name_kernel` and `name_bias` of `module`."""
     k, _, i = x.shape
-    kernel = module.param(f"{name}_kernel", lambda key: scale * he_normal(key, (k, i, features)))
+    kernel = module.param(f"{name}_kernel", lambda key: scale * he_init(key, (k, i, features)))
     bias = module.param(f"{name}_bias", nn.initializers.zeros, (k, features))
     return x @ kernel + bias[:, None, :]

@@ -130,22 +130,40 @@ def _stage(params: Params, stage: int) -> Params:
     return {n.removeprefix(prefix): v for n, v in params.items() if n.startswith(prefix)}
 
 
+def _means(x: Array) -> Array:
+    """Means over the axes, once for each branch, example and channel."""
+    return jnp.mean(x, axis=tuple(range(2, x.ndim - 1)), keepdims=True)
+
+
 def lift(config: ReversibleConfig, x: Float[Array, "k b *axes c"]) -> Halves:
     """First squeeze and zeros up to the channels of the first stage, cut into halves.
 
     Raises:
         ValueError: more samples than channels.
     """
-    y = squeeze(config.gain * x, config.squeezes[0])
-    missing = config.channels - y.shape[-1]
+    level = _means(x)
+    y = squeeze(config.gain * (x - level if config.centred else x), config.squeezes[0])
+    parts = [y]
+    if config.centred:
+        parts.append(jnp.broadcast_to(level, (*y.shape[:-1], x.shape[-1])))
+    missing = config.channels - sum(part.shape[-1] for part in parts)
     if missing < 0:
         raise ValueError(
-            f"channels={config.channels}: expected at least {y.shape[-1]}, the samples that "
-            f"squeezes[0]={config.squeezes[0]} puts side by side; raise it or squeeze less"
+            f"channels={config.channels}: expected at least {config.channels - missing}, the "
+            f"samples that squeezes[0]={config.squeezes[0]} puts side by side (and their mean, if "
+            "centred); raise it or squeeze less"
         )
-    y = jnp.concatenate([y, jnp.zeros((*y.shape[:-1], missing), y.dtype)], axis=-1)
-    half = config.channels // 2
+    parts.append(jnp.zeros((*y.shape[:-1], missing), y.dtype))
+    y, half = jnp.concatenate(parts, axis=-1), config.channels // 2
     return y[..., :half], y[..., half:]
+
+
+def _drop(config: ReversibleConfig, y: Array, channels: int) -> Array:
+    """The inverse of `lift`, on joined halves."""
+    first = config.squeezes[0]
+    size = channels * first ** (y.ndim - 3)
+    x = unsqueeze(y[..., :size], first) / config.gain
+    return x + _means(y[..., size : size + channels]) if config.centred else x
 
 
 def forward(
@@ -206,6 +224,4 @@ def inverse(
         if stage:
             u, v = (unsqueeze(part, config.squeezes[stage]) for part in (u, v))
     y = jnp.concatenate([u, v], axis=-1)
-    first = config.squeezes[0]
-    y = y[..., : channels * first ** (y.ndim - 3)]
-    return unsqueeze(y, first) / config.gain
+    return _drop(config, y, channels)

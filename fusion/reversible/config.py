@@ -21,6 +21,8 @@ class ReversibleConfig:
         depths: blocks of each stage.
         hidden: channels within the two drives of a block.
         taps: width of the drives' convolutions along each axis.
+        centred: the mean of a window is taken out of its samples and put into a channel of its own,
+            so that rhythm and level do not stand in each other's way; needs the room.
         gain: what the samples are multiplied by at first; > 0.
         start: standard deviation of a drive's output at first, relative to its input's.
         recompute: gradients recompute activations, in memory that does not grow with depth; False
@@ -36,6 +38,7 @@ class ReversibleConfig:
     depths: tuple[int, ...] = (2, 2)
     hidden: tuple[int, ...] = (8, 32)
     taps: tuple[int, ...] = (5, 3)
+    centred: bool = False
     gain: float = 2.0
     start: float = 0.5
     recompute: bool = True
@@ -56,7 +59,7 @@ class ReversibleConfig:
             )
         for name in ("gain", "start"):
             check_number(name, getattr(self, name), 0.0, above=True)
-        for name in ("recompute", "learned"):
+        for name in ("centred", "recompute", "learned"):
             check_choice(name, getattr(self, name), (True, False))
 
     @property

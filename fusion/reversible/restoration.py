@@ -89,8 +89,8 @@ def _residual_factor(residuals: Array) -> Array:
 
 def fit_restoration(
     inputs: Float[Array, "n i"],
-    outputs: Float[Array, "n o"],
-    held: tuple[Float[Array, "m i"], Float[Array, "m o"]] | None = None,
+    outputs: Float[Array, "m o"],
+    held: tuple[Float[Array, "p i"], Float[Array, "p o"]] | None = None,
 ) -> Restoration:
     r"""Bayesian linear regression of one sensor's trunk output on those of others.
 

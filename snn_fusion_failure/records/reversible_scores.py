@@ -20,7 +20,9 @@ def memory_of(model: Any) -> float:
     return training_memory(model, HyperParams())
 
 
-def scored(model: Any, state: Any, dataset: Any, noise: Any, kind: str, key: Any) -> dict[str, Any]:
+def scored(
+    model: Any, state: Any, dataset: Any, noise: Any, kind: str, *, key: Any
+) -> dict[str, Any]:
     """Scores of the class probabilities and of the fusion weights under one kind of failure."""
     import jax
 
@@ -78,7 +80,7 @@ def trained_scores(
 
     key, model = jax.random.key(seed), settings.model
     state = fit(*settings, dataset, noise, key=key).state
-    record = scored(model, state, dataset, noise, noise.kind, key)
+    record = scored(model, state, dataset, noise, noise.kind, key=key)
     if model.recipe.loss.auxiliary:
         x, failed = gate_scores.corrupted(
             dataset.test_x, noise.test, noise.kind, key=jax.random.fold_in(key, 3)
@@ -88,6 +90,6 @@ def trained_scores(
     record |= {name: price[name] for name in ("multiply_adds", "synaptic_operations")}
     record |= {"parameters": count_parameters(model)["main"], "training_memory": memory_of(model)}
     if unseen:
-        each = [scored(model, state, dataset, noise, kind, key) for kind in UNSEEN_KINDS]
+        each = [scored(model, state, dataset, noise, kind, key=key) for kind in UNSEEN_KINDS]
         record["unseen"] = {m: float(np.mean([one[m] for one in each])) for m in each[0]}
     return record

@@ -58,8 +58,9 @@ _BAYESIAN = (
 )
 _DRAWN = ("model.encoder.reversible.learned=false", "model.head_widths=[]")
 # As many parameters, and as much memory of training, as rev_conv_argate.
-_PARAMETERS = ("model.encoder.conv_features=[24, 48]",)
-_MEMORY = ("model.encoder.conv_features=[32, 64]",)
+_PARAMETERS = ("model.encoder.conv_features=[24, 52]",)
+_MEMORY = ("model.encoder.conv_features=[8, 16]",)
+_DEEP = ("model.encoder.reversible.depths=[4, 4]",)
 COLUMNS = {
     "baseline": Column("baseline"),
     "argate_l": Column("argate_l"),
@@ -68,6 +69,7 @@ COLUMNS = {
     "rev_conv_baseline": Column("rev_conv_baseline"),
     "rev_conv_argate_plus": Column("rev_conv_argate_plus"),
     "rev_conv_argate": Column("rev_conv_argate"),
+    "rev_conv_argate_deep": Column("rev_conv_argate", _DEEP),
     "rev_conv_drawn_linear": Column("rev_conv_baseline", _DRAWN),
     "rev_conv_oracle": Column("oracle", (), "reversible"),
     "argate_l_bayesian": Column("argate_l", _BAYESIAN, gate="bayesian"),
@@ -88,13 +90,14 @@ ROWS: dict[str, dict[str, Any]] = {
     "n_clean=8 uniform": _random(8),
 }
 """Row -> options of `train_argate`."""
-FEW = ("argate_l_memory", "rev_conv_drawn_linear", "rev_conv_oracle", "argate_l_bayesian",
-       "rev_conv_argate_bayesian", "spiking_argate", "spiking_argate_bayesian")  # fmt: skip
+FEW = tuple(name for name in COLUMNS if name.endswith(("_memory", "_deep", "_linear", "_oracle",
+            "_bayesian")) or name == "spiking_argate")  # fmt: skip
 """Columns of the first two rows only."""
 PAIRS = (
     ("rev_conv_argate", "argate_l"),
     ("rev_conv_argate", "argate_l_parameters"),
     ("rev_conv_argate", "argate_l_memory"),
+    ("rev_conv_argate_deep", "rev_conv_argate"),
     ("rev_conv_baseline", "baseline"),
     ("rev_conv_argate", "rev_conv_baseline"),
     ("rev_conv_argate_plus", "rev_conv_baseline"),

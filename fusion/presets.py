@@ -122,18 +122,15 @@ _SPIKING: dict[str, tuple[SpikingConfig, dict[str, Any], dict[str, Any]]] = {
     ),
     "own": (SpikingConfig(widths=(16, 32), taps=(4, 4), strides=(1, 1)), {}, {}),
 }
-# Stages of the reversible encoders; chosen on validation rows, see docs/reversible_fusion.md. A
-# scalar has nothing to squeeze; it enters by its octaves.
+# Stages of the reversible encoders; see docs/reversible_fusion.md. Windows enter as they enter the
+# convolutions: without their mean, times five. A scalar has nothing to squeeze, nor a mean.
+_WINDOW: dict[str, Any] = {"centred": True, "gain": 5.0}
 _REVERSIBLE: dict[str, tuple[ReversibleConfig, dict[str, Any], dict[str, Any]]] = {
-    "har": (ReversibleConfig(), {}, {}),
-    "driver": (
-        ReversibleConfig(squeezes=(1,), channels=24, depths=(2,), hidden=(24,), taps=(1,)),
-        {},
-        {},
-    ),
-    "simulated": (ReversibleConfig(hidden=(8, 16), taps=(3, 3)), {}, {}),
+    "har": (ReversibleConfig(**_WINDOW), {}, {}),
+    "driver": (ReversibleConfig((1,), channels=24, depths=(2,), hidden=(24,), taps=(1,)), {}, {}),
+    "simulated": (ReversibleConfig(hidden=(8, 16), taps=(3, 3), **_WINDOW), {}, {}),
     "own": (
-        ReversibleConfig(squeezes=(1,), channels=8, depths=(4,), hidden=(16,), taps=(5,)),
+        ReversibleConfig((1,), channels=8, depths=(4,), hidden=(16,), taps=(5,), **_WINDOW),
         {},
         {},
     ),

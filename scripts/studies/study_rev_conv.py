@@ -24,8 +24,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from snn_fusion_failure.records.pairs import paired_rows, with_holm
-from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.rows import compare_columns, record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -245,21 +244,24 @@ def _cells(config: Config) -> list[dict[str, Any]]:
 
 def compared(config: Config) -> list[dict[str, Any]]:
     """Paired differences in points, Holm over all of them."""
-    held, rows = load_runs(config), (*ROWS, UNSEEN_ROW)
-    found = paired_rows(held, rows, PAIRS)
-    for metric, factor in HYPOTHESIS.items():
-        found += paired_rows(held, rows, PAIRS[:2], metric, factor)
-    return with_holm(found)
+    cases: dict[tuple[str, str], dict[int, dict[str, Any]]] = {}
+    linked = {model for pair in PAIRS[:2] for model in pair}
+    for metric, factor in {"accuracy": 1.0, **HYPOTHESIS}.items():
+        for (row, model), by_seed in load_runs(config).items():
+            if row.endswith("restored") or (metric in HYPOTHESIS and model not in linked):
+                continue
+            case = row if metric == "accuracy" else f"{row}, {metric.replace('_', ' ')}"
+            points = {s: {"points": factor * r[metric]} for s, r in by_seed.items() if metric in r}
+            cases[case, model] = points
+    return compare_columns(cases, PAIRS, "points")
 
 
 def write(config: Config) -> list[dict[str, Any]]:
     """Put the table and its comparisons where they belong; returns its rows."""
     rows = _cells(config)
     if rows and not config.validation:
-        path = config.results / f"{NAME}.json"
-        record_table(path, NAME, TITLE, rows, preset=config.preset)
-        held = json.loads(path.read_text(encoding="utf-8"))
-        write_json(path, held | {"comparisons": compared(config)})
+        path, pairs = config.results / f"{NAME}.json", compared(config)
+        record_table(path, NAME, TITLE, rows, preset=config.preset, comparisons=pairs)
     return rows
 
 

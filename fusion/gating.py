@@ -65,9 +65,15 @@ class Gate(nn.Module):
     normalizer: Normalizer
     own_scores: bool = False
 
-    @nn.compact
     def __call__(self, features: Float[Array, "k b f"]) -> Float[Array, "b k"]:
         """Return the fusion weights of every example."""
+        return normalize(self.scores(features)[0], self.normalizer)
+
+    @nn.compact
+    def scores(
+        self, features: Float[Array, "k b f"]
+    ) -> tuple[Float[Array, "b k"], Float[Array, "b h"]]:
+        """Scores before they are normalized, and the hidden layer that they are linear in."""
         k, b, _ = features.shape
         joined = jnp.transpose(features, (1, 0, 2)).reshape(b, -1)
         hidden = nn.relu(nn.Dense(self.width, name="fc_con")(joined))
@@ -75,7 +81,7 @@ class Gate(nn.Module):
         if self.own_scores:
             own = self.param("own", nn.initializers.zeros, features.shape[::2])
             scores = scores + jnp.einsum("kbf,kf->bk", features, own)
-        return normalize(scores, self.normalizer)
+        return scores, hidden
 
 
 def oracle_weights(failed: Bool[Array, "b k"]) -> Float[Array, "b k"]:

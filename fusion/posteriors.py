@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, Key
 
 from fusion._checks import check_count, check_number
 from fusion.config import MODELS, ModelConfig
-from fusion.gating import normalize
+from fusion.gating import Gate, normalize
 from fusion.models import Params, predict
 from fusion.uncertainty import (
     DRAWS,
@@ -88,20 +88,16 @@ class LaplaceGate(NamedTuple):
     covariance: Float[Array, "h k h k"]
 
 
-def _split_inputs(main: Params, features: Float[Array, "k b f"]) -> Float[Array, "b h"]:
-    """Inputs of the gate's last layer, with a one for the bias."""
-    joined = jnp.transpose(features, (1, 0, 2)).reshape(features.shape[1], -1)
-    layer = main["gate"]["fc_con"]
-    hidden = jax.nn.relu(joined @ layer["kernel"] + layer["bias"])
-    return jnp.concatenate([hidden, jnp.ones_like(hidden[:, :1])], axis=1)
-
-
-def _scores(main: Params, features: Array, inputs: Array) -> Array:
-    split = main["gate"]["split"]
-    scores = inputs[:, :-1] @ split["kernel"] + split["bias"]
-    if "own" in main["gate"]:
-        scores = scores + jnp.einsum("kbf,kf->bk", features, main["gate"]["own"])
-    return cast(Array, scores)
+def _scores(
+    main: Params, features: Float[Array, "k b f"]
+) -> tuple[Float[Array, "b k"], Float[Array, "b h"]]:
+    """Scores of the gate, and inputs of its last layer with a one for the bias."""
+    held = main["gate"]
+    gate = Gate(held["fc_con"]["bias"].shape[0], "softmax", own_scores="own" in held)
+    scores, hidden = cast(
+        "tuple[Array, Array]", gate.apply({"params": held}, features, method="scores")
+    )
+    return scores, jnp.concatenate([hidden, jnp.ones_like(hidden[:, :1])], axis=1)
 
 
 def gate_curvature(
@@ -118,14 +114,12 @@ def gate_curvature(
 
     Source: Schraudolph (2002); Daxberger et al. (2021) for the last layer alone.
     """
-    features = predict(config, main, x).features
-    inputs = _split_inputs(main, features)
+    scores, inputs = _scores(main, predict(config, main, x).features)
 
     def head(scores: Float[Array, "b k"]) -> Float[Array, "b c"]:
         given = normalize(scores, config.normalizer)
         return predict(config, main, x, weights=given).logits
 
-    scores = _scores(main, features, inputs)
     logits, push = jax.linearize(head, scores)
     slopes = push_scores(push, scores)
     p = jax.nn.softmax(logits, axis=-1)
@@ -178,9 +172,8 @@ def laplace_moments(
     main: Params, laplace: LaplaceGate, features: Float[Array, "k b f"]
 ) -> tuple[Float[Array, "b k"], Float[Array, "b k k"]]:
     r"""Mean and covariance of the scores: :math:`C_{kl} = \tilde h^T \Sigma_{kl} \tilde h`."""
-    inputs = _split_inputs(main, features)
-    covariance = jnp.einsum("bi,ikjl,bj->bkl", inputs, laplace.covariance, inputs)
-    return _scores(main, features, inputs), covariance
+    scores, inputs = _scores(main, features)
+    return scores, jnp.einsum("bi,ikjl,bj->bkl", inputs, laplace.covariance, inputs)
 
 
 def laplace_predictive(

@@ -1,14 +1,16 @@
 """Speed of lattices: what constraints cost, and forward and backward against pytorch-lattice.
 
     python scripts/benchmarks/bench_lattice.py
-    python scripts/benchmarks/bench_lattice.py --parts peer --record
+    python scripts/benchmarks/bench_lattice.py --parts constraints first_init peer --record
 
-Two parts, all times CPU times of one thread, medians over repeats that alternate between the two
+Three parts, all times CPU times of one thread, medians over repeats that alternate between the two
 sides. `constraints`: a training step with projection over the same step without; 1.15 means that
-constraints cost 15 % of a step. `peer`: forward and backward (slopes of table and inputs) of a
-lattice of 2^6 to 2^12 vertices on a batch of 1,024, over the time of pytorch-lattice on the same
-numbers; it computes in float64, so ours is timed in float32 and in float64. This part needs
-`pip install torch==2.13.0 pandas` and `pip install --no-deps pytorch-lattice==0.2.0`.
+constraints cost 15 % of a step. `first_init`: the first parameters of a lattice that is monotone
+in all inputs, with what has to be compiled. `peer`: the time of pytorch-lattice for forward and
+backward (slopes of table and inputs) of a lattice of 2^6 to 2^12 vertices on a batch of 1,024, over
+ours on the same numbers; it computes in float64, so ours is timed in both. This part needs
+`pip install torch==2.13.0 pandas tqdm` and `pip install --no-deps pytorch-lattice==0.2.0` (it asks
+for an older NumPy than ours and works with it), best in an environment of its own.
 
 Two minutes. `--record` writes `results/bench_lattice.json`; pin the command to a core for steady
 figures: `taskset -c 0 python scripts/benchmarks/bench_lattice.py`.
@@ -21,9 +23,9 @@ import functools
 import statistics
 import time
 from collections.abc import Callable, Mapping
-from pathlib import Path
 from typing import Any, Literal
 
+from snn_fusion_failure.records.rows import summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     provenance,
@@ -31,27 +33,26 @@ from snn_fusion_failure.runs import (
     run_command,
     write_json,
 )
+from snn_fusion_failure.runs.origin import check_recordable
 
 
 @dataclasses.dataclass(frozen=True)
 class Config:
     """What is timed."""
 
-    parts: tuple[Literal["constraints", "peer"], ...] = ("constraints",)
+    parts: tuple[Literal["constraints", "first_init", "peer"], ...] = ("constraints",)
     """Which parts."""
     steps: int = 200
     """Steps of Adam in one jitted scan."""
     repeats: int = 7
     """Timings of each; the median counts."""
     ranks: tuple[int, ...] = (6, 8, 10, 12)
-    """Lattices of the second part: 2^rank vertices."""
+    """Lattices of the other parts: 2^rank vertices."""
     batch: int = 1024
-    """Rows of the second part."""
+    """Rows of the part `peer`."""
     calls: int = 20
-    """Calls in each timing of the second part."""
+    """Calls in each timing of the part `peer`."""
     seed: int = 0
-    out: Path | None = None
-    """Folder for `result.json`; nothing is written without it."""
     record: bool = False
     """Write `results/bench_lattice.json`."""
 
@@ -171,6 +172,25 @@ def constraints(config: Config) -> dict[str, dict[str, float]]:
     return table
 
 
+def first_init(config: Config) -> dict[str, dict[str, float]]:
+    """CPU seconds of the first parameters of lattices with all inputs monotone."""
+    import jax
+
+    from fusion.lattice import LatticeConfig, lattice_layer
+
+    found = {}
+    key = jax.block_until_ready(jax.random.key(config.seed))
+    jax.config.update("jax_enable_compilation_cache", False)
+    for rank in config.ranks:
+        jax.clear_caches()
+        start = time.process_time()
+        jax.block_until_ready(lattice_layer.init(key, LatticeConfig((2,) * rank, (1,) * rank)))
+        found[f"2^{rank}"] = {"seconds": time.process_time() - start}
+        print(f"2^{rank:<3d} first init {found[f'2^{rank}']['seconds']:.3f} s", flush=True)
+    jax.config.update("jax_enable_compilation_cache", True)
+    return found
+
+
 def _ours(rank: int, dtype: str, table: Any, x: Any) -> dict[str, Callable[[], Any]]:
     """Forward, and forward with backward, of the lattice layer."""
     import jax
@@ -253,11 +273,32 @@ def peer(config: Config) -> dict[str, dict[str, float]]:
     return found
 
 
+SHOWN = {
+    "seconds": ("first parameters, all inputs monotone", "s"),
+    "ratio": ("step with projection over step without", "1"),
+    "forward_ratio_float32": ("pytorch-lattice over ours, forward", "1"),
+    "backward_ratio_float32": ("pytorch-lattice over ours, forward and backward", "1"),
+}
+"""Figures of the parts that the page of results has, each a median."""
+
+
+def table_rows(result: dict[str, Any]) -> list[dict[str, Any]]:
+    """The figures of `SHOWN` in the schema of record."""
+    found = []
+    for part in ("first_init", "peer", "constraints"):
+        for row, given in result.get(part, {}).items():
+            for name in SHOWN.keys() & given.keys():
+                metric, unit = SHOWN[name]
+                cell = {"row": row, "model": "float32", "metric": metric, "unit": unit}
+                found.append(cell | summarize([given[name]]))
+    return found
+
+
 def main(config: Config) -> dict[str, Any]:
     """Run the parts; returns what is written."""
     enable_compilation_cache()
     result: dict[str, Any] = {"benchmark": "lattice", "batch": config.batch, **provenance()}
-    for name, part in (("constraints", constraints), ("peer", peer)):
+    for name, part in (("constraints", constraints), ("first_init", first_init), ("peer", peer)):
         if name in config.parts:
             result[name] = part(config)
     if "peer" in config.parts:
@@ -265,21 +306,19 @@ def main(config: Config) -> dict[str, Any]:
 
         peers = {name: version(name) for name in ("torch", "pytorch-lattice")}
         result["versions"] = {**result["versions"], **peers}
+    result |= {"title": "Lattices: constraints, first parameters, pytorch-lattice"}
+    result |= {"rows": table_rows(result)}
     if config.record:
+        check_recordable()
         write_json(repository.RESULTS / "bench_lattice.json", result)
-    if config.out is not None:
-        write_json(config.out / "result.json", result)
     return result
 
 
 def _fields(result: dict[str, Any]) -> dict[str, float]:
-    """Each ratio of the first part; the smallest of the second."""
-    shown = {name: row["ratio"] for name, row in result.get("constraints", {}).items()}
+    """The smallest ratios beside pytorch-lattice."""
     rows = result.get("peer", {}).values()
-    for kind in ("forward", "backward"):
-        if rows:
-            shown[f"smallest_{kind}_ratio"] = min(row[f"{kind}_ratio_float32"] for row in rows)
-    return shown
+    names = ("forward_ratio_float32", "backward_ratio_float32") if rows else ()
+    return {f"smallest_{name}": min(row[name] for row in rows) for name in names}
 
 
 if __name__ == "__main__":

@@ -48,6 +48,7 @@ RULES = (
     # Not run. tests/snn_fusion_failure/test_check_commands.py holds their number.
     Rule("bench_snn.py --brian2-python", not_run="needs an interpreter with Brian 2"),
     Rule("bench_fusion.py", not_run=_TORCH),
+    Rule("bench_lattice.py peer", not_run=_TORCH),
     Rule("bench_bo.py", not_run="compares with BoTorch, which needs PyTorch (extra `bench`)"),
     Rule(
         "sweep.py --distributed", not_run="is one of two machines; test_sweep_layouts.py runs two"

@@ -7,6 +7,7 @@ import doctest
 import importlib
 import itertools
 import math
+import time
 from pathlib import Path
 
 import jax
@@ -396,3 +397,12 @@ def test_examples_in_docstrings(name: str) -> None:
 @pytest.mark.relaxed  # optax promotes dtypes
 def test_examples_of_the_optimizer() -> None:
     assert doctest.testmod(importlib.import_module("fusion.lattice.optimizer")).attempted > 0
+
+
+def test_the_first_parameters_of_many_monotone_inputs_are_quick() -> None:
+    config = LatticeConfig((2,) * 12, (1,) * 12)
+    key = jax.block_until_ready(jax.random.key(3))
+    start = time.process_time()
+    params = jax.block_until_ready(lattice_layer.init(key, config))
+    assert time.process_time() - start < 0.5  # 6.4 s when every axis was projected
+    assert lattice_layer.check(config, params) == 0.0

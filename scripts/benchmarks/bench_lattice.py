@@ -162,12 +162,9 @@ def constraints(config: Config) -> dict[str, dict[str, float]]:
             for kind, p in (("free", None), ("projected", project))
         }
         times = _alternate(calls, config.repeats, config.steps)
-        pairs = zip(times["free"], times["projected"], strict=True)
-        table[name] = {
-            "free_us": statistics.median(times["free"]),
-            "projected_us": statistics.median(times["projected"]),
-            "ratio": statistics.median(b / a for a, b in pairs),
-        }
+        pairs = zip(*times.values(), strict=True)
+        row = {f"{kind}_us": statistics.median(found) for kind, found in times.items()}
+        table[name] = row | {"ratio": statistics.median(b / a for a, b in pairs)}
         print(f"{name:36s} ratio {table[name]['ratio']:.3f}", flush=True)
     return table
 
@@ -178,7 +175,7 @@ def first_init(config: Config) -> dict[str, dict[str, float]]:
 
     from fusion.lattice import LatticeConfig, lattice_layer
 
-    found = {}
+    found: dict[str, dict[str, float]] = {}
     key = jax.block_until_ready(jax.random.key(config.seed))
     jax.config.update("jax_enable_compilation_cache", False)
     for rank in config.ranks:
@@ -186,7 +183,6 @@ def first_init(config: Config) -> dict[str, dict[str, float]]:
         start = time.process_time()
         jax.block_until_ready(lattice_layer.init(key, LatticeConfig((2,) * rank, (1,) * rank)))
         found[f"2^{rank}"] = {"seconds": time.process_time() - start}
-        print(f"2^{rank:<3d} first init {found[f'2^{rank}']['seconds']:.3f} s", flush=True)
     jax.config.update("jax_enable_compilation_cache", True)
     return found
 
@@ -243,8 +239,7 @@ def peer(config: Config) -> dict[str, dict[str, float]]:
         raise ValueError(
             "parts=peer: expected torch and pytorch-lattice; install them as --help says"
         ) from error
-    rng = np.random.default_rng(config.seed)
-    found = {}
+    rng, found = np.random.default_rng(config.seed), {}
     for rank in config.ranks:
         table = rng.normal(size=(2,) * rank).astype(np.float32)
         x = rng.uniform(size=(config.batch, rank)).astype(np.float32)
@@ -306,8 +301,8 @@ def main(config: Config) -> dict[str, Any]:
 
         peers = {name: version(name) for name in ("torch", "pytorch-lattice")}
         result["versions"] = {**result["versions"], **peers}
-    result |= {"title": "Lattices: constraints, first parameters, pytorch-lattice"}
-    result |= {"rows": table_rows(result)}
+    title = "Lattices: constraints, first parameters, pytorch-lattice"
+    result |= {"title": title, "rows": table_rows(result)}
     if config.record:
         check_recordable()
         write_json(repository.RESULTS / "bench_lattice.json", result)

@@ -7,7 +7,8 @@ replaced by noise in two thirds of the windows, and ends with both accuracies be
 pictures, and a line `result: ...`: a minute and a half of CPU time. `--protocol` trains one case.
 `--preset quick` takes few epochs; the default `paper` has the settings of record. With
 `--dataset simulated` no data file is needed; `--data my.npz` takes your own windows: arrays `x`
-[N, K, T] and `y` [N], and if you like `groups` [N], `channels` [K] and `classes` [C].
+[N, K, T] and `y` [N], and if you like `groups` [N], `channels` [K] and `classes` [C]; and
+`--data FOLDER` takes sensors of unequal shapes from CSV files and a schema, see docs/data.md.
 """
 
 from __future__ import annotations
@@ -93,6 +94,10 @@ def train_case(
 def main(config: Config) -> dict[str, Any]:
     """Train, score, draw; returns what `result.json` holds."""
     enable_compilation_cache()
+    if config.data is not None and config.data.is_dir():
+        from snn_fusion_failure.commands.argate_folder import train_folder
+
+        return train_folder(config)
     from fusion.data import load, validation_split
     from fusion.sizes import count_parameters
 

@@ -48,7 +48,6 @@ RULES = (
     # Not run. tests/snn_fusion_failure/test_check_commands.py holds their number.
     Rule("bench_snn.py --brian2-python", not_run="needs an interpreter with Brian 2"),
     Rule("bench_fusion.py", not_run=_TORCH),
-    Rule("bench_lattice.py peer", not_run=_TORCH),
     Rule("bench_bo.py", not_run="compares with BoTorch, which needs PyTorch (extra `bench`)"),
     Rule(
         "sweep.py --distributed", not_run="is one of two machines; test_sweep_layouts.py runs two"
@@ -131,6 +130,11 @@ RULES = (
     Rule(
         "study_bayesian_gate.py",
         "--preset quick --seeds 1 --networks argate_l bayesian --train-only",
+    ),
+    Rule(
+        "bench_lattice.py peer",
+        "--steps 2 --repeats 1 --ranks 6 --calls 1",
+        needs="pytorch_lattice",
     ),
     Rule("bench_lattice.py", "--steps 2 --repeats 1"),
     Rule("simulate_kitti.py --picture", "--size tiny"),

@@ -306,3 +306,22 @@ def test_the_study_collects_what_is_there(tmp_path: Path) -> None:
         ("har: redraw=False", "baseline"): [71.0],
         ("har: preset", "argate_ws"): [72.0],
     }
+
+
+@pytest.mark.slow
+def test_a_folder_of_csv_files_is_trained_on(tmp_path: Path) -> None:
+    folder = repository.ROOT / "examples" / "own_sensors"
+    config = Config(data=folder, model="netgated", epochs=2, out=tmp_path / "run")
+    summary = train_argate.main(config)
+    lines = (tmp_path / "run" / "predictions.csv").read_text().splitlines()
+    assert lines[0] == "id,predicted,failed" and len(lines) == 1 + summary["rows"]["test"]
+    assert {line.split(",")[1] for line in lines[1:]} <= {"walk", "run"}
+    assert any(line.endswith(",imu") for line in lines)
+    assert 0.0 <= summary["scores"]["accuracy_corrupted"] <= 100.0
+
+
+def test_options_of_equal_windows_are_refused_for_a_folder(tmp_path: Path) -> None:
+    with pytest.raises(ValueError, match=r"head='dense': not read with --data FOLDER"):
+        train_argate.main(Config(data=tmp_path, head="dense"))
+    with pytest.raises(ValueError, match="expected clean or random"):
+        train_argate.main(Config(data=tmp_path, protocol="fixed"))

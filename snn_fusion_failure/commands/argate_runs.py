@@ -29,8 +29,7 @@ class Config:
     dataset: str = "har"
     """har, driver or simulated."""
     data: Path | None = None
-    """Your own windows instead: .npz with x, y and optional groups, channels, classes; or a folder
-    of CSV files with schema.json, which has options of its own."""
+    """Your own windows: .npz with x, y and optional names, or a folder with schema.json."""
     model: str = "argate_l"
     """baseline, netgated, argate_ws, argate_plus, argate_l; *_printed (to the letter); or
     equal_weights, modality_dropout, embracenet, oracle; spiking_argate and others of spiking_*;

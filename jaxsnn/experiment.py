@@ -51,7 +51,7 @@ class Experiment(NamedTuple):
 
 
 def run_experiment(
-    config: NetworkConfig,
+    config: NetworkConfig | None,
     params: Any,
     map: world.WorldParams,
     *,
@@ -63,7 +63,7 @@ def run_experiment(
     block: int = 8,
     circles: Int[Array, " trials"] | None = None,
     weights: Weights | None = None,
-    states: NetworkState | None = None,
+    states: Any = None,
     params_axis: Any = None,
     map_axis: Any = None,
     test_map: world.WorldParams | None = None,
@@ -75,7 +75,7 @@ def run_experiment(
     """Robots learn, then are tested: both phases of all robots in one program.
 
     Args:
-        config: NetworkConfig.
+        config: NetworkConfig; None with `agents`.
         params: SNNParams, or what `agents` take.
         map: the map to learn on.
         keys: one per robot (an independent run each).
@@ -112,15 +112,18 @@ def run_experiment(
         agents is None or (reward is None and weights is None),
         "agents, reward, weights: expected no reward and no weights beside agents; they have both",
     )
-    learner, frozen = agents or (snn_agent(config, reward=reward), snn_agent(config, plastic=False))
     require(
         weights is None or states is None,
         "weights, states: expected one of them; the states hold weights",
     )
-    if weights is not None:
-        network.check_weights(config, params.network, weights, robots)
-    if states is not None and agents is None:
-        network.check_weights(config, params.network, states.weights, robots)
+    if agents is None:
+        if config is None:
+            raise ValueError("config=None: expected a NetworkConfig; or give agents of your own")
+        given = weights if states is None else states.weights
+        if given is not None:
+            network.check_weights(config, params.network, given, robots)
+        agents = snn_agent(config, reward=reward), snn_agent(config, plastic=False)
+    learner, frozen = agents
 
     def run(
         robot_keys: Array, weights: Any, states: Any, params: Any, map: Any, test_map: Any

@@ -16,6 +16,7 @@ PACKAGES = {
 BY_PATH = {
     "jaxsnn.brax_env": "robots as environments of brax, and what brax needs to run them",
     "jaxsnn.declared": "networks from populations and projections",
+    "jaxsnn.declared_agent": "such a network as the driver of a robot",
     "jaxsnn.drivers": "drivers that do not learn, for comparison",
     "jaxsnn.map_files": "maps from files",
     "jaxsnn.navigation": "the robot as a task for PPO",

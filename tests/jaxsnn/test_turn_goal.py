@@ -148,6 +148,8 @@ def test_agents_of_one_s_own_take_the_network_s_place():
         agents=(driver, driver),
     )  # fmt: skip
     assert made.testing.status.tolist() == [[Status.ARRIVED] * 2] * 3
+    with pytest.raises(ValueError, match="config=None: expected a NetworkConfig"):
+        run_experiment(None, params, scenarios.scenario(1), keys=keys)
     with pytest.raises(ValueError, match="expected no reward and no weights beside agents"):
         run_experiment(
             config, params, scenarios.scenario(1), keys=keys, agents=(driver, driver),

@@ -90,7 +90,6 @@ def _residual_factor(residuals: Array) -> Array:
 def fit_restoration(
     inputs: Float[Array, "n i"],
     outputs: Float[Array, "m o"],
-    held: tuple[Float[Array, "p i"], Float[Array, "p o"]] | None = None,
 ) -> Restoration:
     r"""Bayesian linear regression of one sensor's trunk output on those of others.
 
@@ -103,8 +102,6 @@ def fit_restoration(
     Args:
         inputs, outputs: rows of `trunk_rows` of the working sensors, side by side, and of the
             failed one, in training windows.
-        held: rows of people (or days) that the others have not; R is then that of their residuals,
-            which new people's are more like.
 
     Raises:
         ValueError: rows that differ in number, or fewer than two.
@@ -121,11 +118,21 @@ def fit_restoration(
     moments = (*_moments(inputs), *_moments(outputs))
     x, y = _scaled(inputs, *moments[:2]), _scaled(outputs, *moments[2:])
     posterior = fit_linear(x, y, prior_variance=1.0 / inputs.shape[1])
-    seen, told = (x, y)
-    if held is not None:
-        seen, told = _scaled(held[0], *moments[:2]), _scaled(held[1], *moments[2:])
-    residuals = told - predict_linear(posterior, seen)[0]
+    residuals = y - predict_linear(posterior, x)[0]
     return Restoration(posterior, *moments, _residual_factor(residuals))
+
+
+def spread_of_others(
+    restoration: Restoration, inputs: Float[Array, "n i"], outputs: Float[Array, "n o"]
+) -> Restoration:
+    """The same regression, R that of its residuals for people (or days) that it was not fitted on.
+
+    Residuals of the rows of the fit are too small for others.
+    """
+    x = _scaled(inputs, restoration.shift_in, restoration.scale_in)
+    y = _scaled(outputs, restoration.shift_out, restoration.scale_out)
+    residuals = y - predict_linear(restoration.posterior, x)[0]
+    return restoration._replace(factor=_residual_factor(residuals))
 
 
 def _scaled(x: Array, shift: Array, scale: Array) -> Array:

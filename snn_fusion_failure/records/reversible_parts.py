@@ -96,10 +96,11 @@ def by_network(inputs: Any, outputs: Any, new: Any, *, key: Any) -> Any:
 
     chosen = jax.random.permutation(key, len(inputs))[:BNN_ROWS]
     shift = jnp.mean(inputs, axis=0)
-    axes = jnp.linalg.eigh((inputs - shift[None]).T @ (inputs - shift[None]))[1][:, -COMPONENTS:]
+    centred = inputs[chosen] - shift[None]
+    values, vectors = jnp.linalg.eigh(centred @ centred.T)
+    axes = centred.T @ vectors[:, -COMPONENTS:] / jnp.sqrt(values[None, -COMPONENTS:])
     config, training = bnn.BNNConfig(hidden=64, steps=600), bnn.BNNTrainParams()
-    scores = (inputs - shift[None]) @ axes
-    fitted, _ = bnn.fit(config, training, scores[chosen], outputs[chosen], key=key)
+    fitted, _ = bnn.fit(config, training, centred @ axes, outputs[chosen], key=key)
     return bnn.predict(fitted, (new - shift[None]) @ axes)
 
 
@@ -123,28 +124,27 @@ def restorations(
         "nearest neighbour": (nearest(train, test, sensor), None),
     }
     # A line between windows, the same density in their own coordinates.
-    plain = r.fit_restoration(without(train, sensor), own, (without(held, sensor), held[:, sensor]))
+    plain = r.fit_restoration(without(train, sensor), own)
+    plain = r.spread_of_others(plain, without(held, sensor), held[:, sensor])
     found["line on windows"] = _drawn(plain, without(test, sensor), key=key)
     found["line fitted on the same people (bound)"] = _crossed(test, sensor), None
     for trunk, params in (("", main), (", trunk as drawn", drawn)):
         rows, seen, new = (r.trunk_rows(config, params, x) for x in (train, held, test))
-        inputs, target = without(rows, sensor), rows[:, sensor]
+        asked, target = without(new, sensor), rows[:, sensor]
+        fit = r.fit_restoration(without(rows, sensor), target)
+        spreads = {"": r.spread_of_others(fit, without(seen, sensor), seen[:, sensor])}
         if not trunk:
+            spreads[", spread of training rows"] = fit
             zero = jnp.zeros_like(new[:, sensor])
-            found["zero features"] = r.rows_to_windows(config, params, zero, sensor), None
-            network = by_network(inputs, target, without(new, sensor), key=key)
-            back = r.rows_to_windows(config, params, network, sensor)
-            found["Bayesian network on features"] = back, None
-            exact = r.rows_to_windows(config, params, new[:, sensor], sensor)
-            found["its own features"] = exact, None
-        pair = without(seen, sensor), seen[:, sensor]
-        for spread, others in ((", spread of training rows", None), ("", pair)):
-            if trunk and others is None:
-                continue
-            fit = r.fit_restoration(inputs, target, others)
-            back = r.restore_windows(
-                config, params, fit, without(new, sensor), sensor, key=key, level=LEVEL
-            )
+            network = by_network(without(rows, sensor), target, asked, key=key)
+            for name, outputs in (
+                ("zero features", zero),
+                ("Bayesian network on features", network),
+                ("its own features", new[:, sensor]),
+            ):
+                found[name] = r.rows_to_windows(config, params, outputs, sensor), None
+        for spread, of in spreads.items():
+            back = r.restore_windows(config, params, of, asked, sensor, key=key, level=LEVEL)
             found[f"Bayesian line on features{trunk}{spread}"] = back.mean, (back.low, back.high)
     return found
 

@@ -15,6 +15,7 @@ from fusion.reversible.restoration import (
     restore_windows,
     restored_rows,
     rows_to_windows,
+    spread_of_others,
     trunk_rows,
 )
 
@@ -68,7 +69,7 @@ def test_residuals_of_held_rows_set_the_spread() -> None:
     noise = jnp.asarray(rng.normal(size=(300, 1)), jnp.float32)
     line = x[:, :1] - x[:, 1:]
     narrow = fit_restoration(x, line + 0.1 * noise)
-    wide = fit_restoration(x, line + 0.1 * noise, (x, line + noise))
+    wide = spread_of_others(narrow, x, line + noise)
     spread = [float(r.factor[0, 0] * r.scale_out[0]) for r in (narrow, wide)]
     assert spread == pytest.approx([0.1, 1.0], rel=0.15)
 

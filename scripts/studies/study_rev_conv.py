@@ -116,7 +116,7 @@ METRICS = {
 }
 SENSORS = {"body_acc_x": 0, "body_gyro_x": 3, "total_acc_x": 6}
 """Sensors that are restored, one at a time, and their places."""
-RESTORED = {"rmse": "sd", "largest_error": "1", "coverage_90": "%", "accuracy": "%"}
+RESTORED = {"rmse": "sd", "largest_error": "1", "coverage_90": "%", "restored_accuracy": "%"}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -305,7 +305,7 @@ def main(config: Config) -> dict[str, Any]:
                 bar.advance(task)
     rows = write(config)
     for row in rows:
-        if row["metric"] in ("accuracy", "rmse", "training_memory"):
+        if row["metric"] in ("accuracy", "rmse", "memory_by_depth"):
             unit = row["unit"]
             print(f"{row['row']:26} {row['model']:40} {row['mean']:9.3f} {unit} of {row['n']}")
     print_result(study=NAME, runs=len(todo), cells=len(rows))

@@ -63,7 +63,7 @@ def memory_by_depth(
         for name, recompute in (("recomputed", True), ("stored", False)):
             deep = with_trunk(model, depths=(depth // stages,) * stages, recompute=recompute)
             memory = training_memory(deep, hyper, len(x))
-            cell = {"row": f"depth {depth}", "model": name, "metric": "training_memory"}
+            cell = {"row": f"depth {depth}", "model": name, "metric": "memory_by_depth"}
             rows.append(cell | {"unit": "MB", "value": memory})
             trunk = deep.encoder.reversible
             params = blocks.init(jax.random.key(0), trunk, windows.shape[0])
@@ -191,7 +191,7 @@ def restoration_scores(
         own = {
             "rmse": float(jnp.sqrt(jnp.mean(error**2))) / spread,
             "largest_error": float(jnp.max(jnp.abs(error))),
-            "accuracy": 100.0 * float(np.mean(logits.argmax(-1) == labels)),
+            "restored_accuracy": 100.0 * float(np.mean(logits.argmax(-1) == labels)),
         }
         if interval is not None:
             inside = (truth >= interval[0]) & (truth <= interval[1])

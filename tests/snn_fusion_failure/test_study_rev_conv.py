@@ -39,7 +39,7 @@ def test_single_runs_become_rows_and_paired_tests(tmp_path: Path) -> None:
     restored = study.Run("restoration", "rev_conv_argate", 0)
     write_json(restored.path(config), {"body_acc_x": {"zeros": {"rmse": 1.0}}})
     memory = study.Run("memory", "rev_conv_argate", 0)
-    cell = {"row": "depth 4", "model": "stored", "metric": "training_memory", "unit": "MB"}
+    cell = {"row": "depth 4", "model": "stored", "metric": "memory_by_depth", "unit": "MB"}
     write_json(memory.path(config), {"cells": [cell | {"value": 7.5}]})
     study.main(config)
     held = json.loads((tmp_path / "results" / "study_rev_conv.json").read_text())
@@ -47,7 +47,7 @@ def test_single_runs_become_rows_and_paired_tests(tmp_path: Path) -> None:
     assert means["n_clean=5 uniform", "rev_conv_argate", "accuracy"] == pytest.approx(92.5)
     assert means["unseen kinds", "argate_l", "accuracy"] == pytest.approx(70.0)
     assert means["body_acc_x restored", "zeros", "rmse"] == 1.0
-    assert means["depth 4", "stored", "training_memory"] == 7.5
+    assert means["depth 4", "stored", "memory_by_depth"] == 7.5
     found = {pair["row"]: pair for pair in held["comparisons"]}
     # Differences 2, 2.5 and 3: t = 2.5 / (0.5 / sqrt 3); those of the AUROC are in points.
     assert found["n_clean=5 uniform"]["t"] == pytest.approx(2.5 / (0.5 / 3**0.5))
@@ -68,7 +68,7 @@ def test_memory_grows_with_depth_only_where_activations_are_stored() -> None:
     made = preset(data, "rev_conv_argate", "quick")
     cells = reversible_parts.memory_by_depth(made.model, made.hyper, data.train_x[:32], (2, 16))
     found = {(c["row"], c["model"], c["metric"]): c["value"] for c in cells}
-    memory = {key[:2]: value for key, value in found.items() if key[2] == "training_memory"}
+    memory = {key[:2]: value for key, value in found.items() if key[2] == "memory_by_depth"}
     assert memory["depth 16", "recomputed"] < 1.15 * memory["depth 2", "recomputed"]
     assert memory["depth 16", "stored"] > 1.5 * memory["depth 2", "stored"]
     assert found["depth 16", "recomputed", "gradient_difference"] < 1e-3

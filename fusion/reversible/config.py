@@ -26,7 +26,7 @@ class ReversibleConfig:
         gain: what the samples are multiplied by at first; > 0.
         start: standard deviation of a drive's output at first, relative to its input's.
         recompute: gradients recompute activations, in memory that does not grow with depth; False
-            stores them, which takes a quarter less time.
+            stores them, which saves computing them again.
         learned: False leaves the encoder as it was drawn, for comparison.
 
     Raises:

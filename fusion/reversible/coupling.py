@@ -54,7 +54,7 @@ def couple(
     .. math:: u_{n+1} = u_n + F_n(v_n), \qquad v_{n+1} = v_n + G_n(u_{n+1})
 
     The gradient undoes the blocks one by one and recomputes their activations on the way, so that
-    its memory does not grow with the depth; it takes about a third more time. It can be
+    its memory does not grow with the depth; it computes each drive once more. It can be
     differentiated once, and in reverse only; `couple_stored` knows no such limit.
 
     Args:

@@ -22,6 +22,10 @@ RIDGE = 1e-4
 """Share of the mean variance that is added to covariances before they are factored."""
 
 
+ITERATIONS = 6
+"""Updates of the noise by its evidence; they settle within a few where rows are many."""
+
+
 class Restoration(NamedTuple):
     """Conditional density of one sensor's trunk output, given those of others.
 
@@ -117,7 +121,7 @@ def fit_restoration(
     """
     moments = (*_moments(inputs), *_moments(outputs))
     x, y = _scaled(inputs, *moments[:2]), _scaled(outputs, *moments[2:])
-    posterior = fit_linear(x, y, prior_variance=1.0 / inputs.shape[1])
+    posterior = fit_linear(x, y, prior_variance=1.0 / inputs.shape[1], iterations=ITERATIONS)
     residuals = y - predict_linear(posterior, x)[0]
     return Restoration(posterior, *moments, _residual_factor(residuals))
 

@@ -29,7 +29,6 @@ def scored(
     from fusion import evaluate
     from fusion.loop import test_output
     from fusion.models import export
-    from fusion.uncertainty import sample_predictive
 
     out = test_output(model, state, dataset, noise, key=key, kind=kind)
     p, weights = np.asarray(jax.nn.softmax(out.logits, axis=-1)), out.weights
@@ -37,8 +36,8 @@ def scored(
         x, _ = gate_scores.corrupted(
             dataset.test_x, noise.test, kind, key=jax.random.fold_in(key, 3)
         )
-        draw = functools.partial(jax.jit(sample_predictive, static_argnums=0), model)
-        p, weights = gate_scores.in_chunks(functools.partial(draw, export(state.params)), x)
+        drawn = functools.partial(_draws(model), export(state.params))
+        p, weights = gate_scores.in_chunks(drawn, x)
     found: dict[str, Any] = gate_scores.class_scores(p, out.labels)
     split = evaluate.split_accuracy(out.labels, p.argmax(-1), out.failed)
     found["accuracy_clean"], found["accuracy_corrupted"] = 100 * split.clean, 100 * split.corrupted
@@ -47,18 +46,35 @@ def scored(
     return found
 
 
+@functools.lru_cache(maxsize=32)
+def _auxiliary_logits(model: Any) -> Any:
+    import jax
+
+    from fusion.models import auxiliary_logits, export, predict
+
+    def logits(params: Any, x: Any) -> Any:
+        return auxiliary_logits(model, params, x, predict(model, export(params), x).features)
+
+    return jax.jit(logits)
+
+
+@functools.lru_cache(maxsize=32)
+def _draws(model: Any) -> Any:
+    import jax
+
+    from fusion.uncertainty import sample_predictive
+
+    return functools.partial(jax.jit(sample_predictive, static_argnums=0), model)
+
+
 def auxiliary(model: Any, params: Any, x: Any, failed: Any, y: np.ndarray) -> dict[str, float]:
     """Loss and accuracy % of the auxiliary paths of working sensors."""
     import jax
 
     from fusion.losses import cross_entropy
-    from fusion.models import auxiliary_logits, export, predict
 
-    @jax.jit
-    def logits_of(x: Any) -> Any:
-        return auxiliary_logits(model, params, x, predict(model, export(params), x).features)
-
-    parts = [logits_of(x[i : i + 512]) for i in range(0, len(x), 512)]
+    logits_of = _auxiliary_logits(model)
+    parts = [logits_of(params, x[i : i + 512]) for i in range(0, len(x), 512)]
     logits = np.concatenate([np.asarray(part) for part in parts])
     told = np.broadcast_to(y[:, None], logits.shape[:2])
     works = ~np.asarray(failed)

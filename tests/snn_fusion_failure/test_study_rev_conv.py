@@ -65,7 +65,7 @@ def test_the_nearest_window_is_by_the_other_sensors() -> None:
 @pytest.mark.slow
 def test_memory_grows_with_depth_only_where_activations_are_stored() -> None:
     data = load("simulated")
-    made = preset(data, "rev_conv_argate", "quick")
+    made = preset(data, "rev_conv_baseline", "quick")
     cells = reversible_parts.memory_by_depth(made.model, made.hyper, data.train_x[:32], (2, 16))
     found = {(c["row"], c["model"], c["metric"]): c["value"] for c in cells}
     memory = {key[:2]: value for key, value in found.items() if key[2] == "memory_by_depth"}

@@ -13,7 +13,7 @@ import flax.linen as nn
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Int
 
-from fusion.lattice import categorical, deep_lattice, ensemble, pwl
+from fusion.lattice import categorical, cdf, deep_lattice, ensemble, kronecker, pwl
 from fusion.lattice import linear as linear_layer
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.tagged import init_tagged, layer_of
@@ -101,4 +101,28 @@ class DeepLattice(_Layer):
     @nn.compact
     def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch"]:
         """The network's output."""
+        return self._apply(self.config, x, self.param_dtype)
+
+
+class KroneckerLattice(_Layer):
+    """Sum of products of curves, `[..., n_inputs] -> [...]`."""
+
+    config: kronecker.KroneckerConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch"]:
+        """The output."""
+        return self._apply(self.config, x, self.param_dtype)
+
+
+class CDF(_Layer):
+    """Rising functions of soft steps, `[..., n_inputs] -> [..., n_outputs]`."""
+
+    config: cdf.CDFConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch n_outputs"]:
+        """Outputs in [0, 1]."""
         return self._apply(self.config, x, self.param_dtype)

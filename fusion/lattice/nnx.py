@@ -16,9 +16,11 @@ from flax import nnx
 from jaxtyping import Array, Float, Shaped
 
 from fusion.lattice.categorical import CategoricalConfig
+from fusion.lattice.cdf import CDFConfig
 from fusion.lattice.checks import refusal
 from fusion.lattice.deep_lattice import DeepLatticeConfig
 from fusion.lattice.ensemble import EnsembleConfig
+from fusion.lattice.kronecker import KroneckerConfig
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.linear import LinearConfig
 from fusion.lattice.pwl import PWLConfig
@@ -89,6 +91,18 @@ class DeepLattice(_Layer):
     """Calibrators, linear embedding, calibrators, lattices, `[..., n_inputs] -> [...]`."""
 
     config: DeepLatticeConfig
+
+
+class KroneckerLattice(_Layer):
+    """Sum of products of curves, `[..., n_inputs] -> [...]`."""
+
+    config: KroneckerConfig
+
+
+class CDF(_Layer):
+    """Rising functions of soft steps, `[..., n_inputs] -> [..., n_outputs]`."""
+
+    config: CDFConfig
 
 
 def _layers(model: nnx.Module) -> list[tuple[tuple[Any, ...], _Layer]]:

@@ -18,7 +18,17 @@ from flax import struct
 from flax.core import meta
 from jaxtyping import Array, Float
 
-from fusion.lattice import categorical, deep_lattice, ensemble, lattice_layer, linear, premade, pwl
+from fusion.lattice import (
+    categorical,
+    cdf,
+    deep_lattice,
+    ensemble,
+    kronecker,
+    lattice_layer,
+    linear,
+    premade,
+    pwl,
+)
 from fusion.lattice.checks import refusal
 from fusion.lattice.lattice_config import LatticeConfig
 
@@ -29,6 +39,8 @@ LAYERS: dict[type, ModuleType] = {
     LatticeConfig: lattice_layer,
     ensemble.EnsembleConfig: ensemble,
     deep_lattice.DeepLatticeConfig: deep_lattice,
+    kronecker.KroneckerConfig: kronecker,
+    cdf.CDFConfig: cdf,
     premade.CalibratedConfig: premade,
 }
 """Configuration -> the module of functions that understands it."""

@@ -28,6 +28,8 @@ from fusion.lattice import (
     with_projection,
 )
 from fusion.lattice import nnx as lattice_nnx
+from fusion.lattice.cdf import CDFConfig
+from fusion.lattice.kronecker import KroneckerConfig
 from fusion.lattice.nnx import check_model
 from fusion.lattice.tagged import Tagged, layer_of, tag
 
@@ -44,6 +46,8 @@ LAYERS: dict[str, tuple[Any, jax.Array]] = {
     "Linear": (LinearConfig(3, 2, (1, 0, -1), normalized=True), X),
     "Lattice": (LatticeConfig((3, 2, 2), (1, 0, -1)), X),
     "Ensemble": (EnsembleConfig(3, ((0, 1), (1, 2)), monotonicity=(1, 0, 0)), X),
+    "KroneckerLattice": (KroneckerConfig(3, monotonicity=(1, 0, -1)), X),
+    "CDF": (CDFConfig(3, 2, 4), X),
     "DeepLattice": (DeepLatticeConfig(3, (1, 0, 0), n_keypoints=3, n_hidden_keypoints=3), X),
 }
 

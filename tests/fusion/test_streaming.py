@@ -12,7 +12,7 @@ import pytest
 
 from fusion import Corruption, FittedARGate, finish, fit, load, preset, random_failing
 from fusion.data import validation_split
-from fusion.portable import write_program
+from fusion.portable import write_onnx, write_program
 from fusion.streaming import SensorStream
 
 
@@ -79,6 +79,34 @@ def test_another_process_runs_the_program_without_this_package(
             np.testing.assert_allclose(theirs[name], getattr(ours, field), atol=1e-5)
 
 
+ONNX_READER = """
+import sys, numpy as np, onnxruntime
+session = onnxruntime.InferenceSession(sys.argv[1])
+(name,) = (given.name for given in session.get_inputs())
+out = session.run(None, {name: np.load(sys.argv[2])})
+assert not any(n.split(".")[0] in ("fusion", "jax") for n in sys.modules)
+np.savez(sys.argv[3], *out)
+"""
+
+
+def test_a_runtime_without_jax_gives_the_same(fitted: FittedARGate, tmp_path: Path) -> None:
+    for name in ("jax2onnx", "onnxruntime"):
+        pytest.importorskip(name, reason="pip install 'snn-fusion-failure[onnx]'")
+    sizes = fitted.config.n_sensors, fitted.config.n_times
+    x = np.random.default_rng(1).normal(size=(5, *sizes)).astype(np.float32)
+    x[1, 0, 3] = np.nan
+    write_onnx(fitted, tmp_path / "net.onnx", batch=5)
+    np.save(tmp_path / "x.npy", x)
+    files = [str(tmp_path / name) for name in ("net.onnx", "x.npy", "y.npz")]
+    subprocess.run([sys.executable, "-I", "-c", ONNX_READER, *files], check=True, cwd=tmp_path)
+    ours = fitted.predict(x)
+    with np.load(tmp_path / "y.npz") as theirs:
+        for name, field in zip(
+            theirs.files, ("probabilities", "weights", "failure_probability"), strict=True
+        ):
+            np.testing.assert_allclose(theirs[name], getattr(ours, field), atol=1e-5)
+
+
 def test_a_number_of_windows_is_checked(fitted: FittedARGate, tmp_path: Path) -> None:
     pytest.importorskip("flatbuffers")
     with pytest.raises(ValueError, match="batch=0"):
@@ -91,3 +119,5 @@ def test_what_is_no_network_or_cannot_be_written_is_refused(
     monkeypatch.setattr("importlib.util.find_spec", lambda name: None)
     with pytest.raises(ModuleNotFoundError, match="snn-fusion-failure"):
         write_program(fitted, tmp_path / "net.stablehlo")
+    with pytest.raises(ModuleNotFoundError, match=r"snn-fusion-failure\[onnx\]"):
+        write_onnx(fitted, tmp_path / "net.onnx")

@@ -130,14 +130,14 @@ def cells(config: Config) -> list[Cell]:
     Raises:
         ValueError: an unknown failure, or a severity that is not 1 to 5.
     """
-    from fusion.detection.learning.training import SENSOR_FAILURES
+    from fusion.detection.learning.training import FAILURES
 
-    unknown = [kind for kind in config.kinds if kind not in SENSOR_FAILURES]
+    unknown = [kind for kind in config.kinds if kind not in FAILURES]
     if unknown:
-        raise ValueError(f"kinds={unknown[0]!r}: expected of {', '.join(SENSOR_FAILURES)}")
+        raise ValueError(f"kinds={unknown[0]!r}: expected of {', '.join(FAILURES)}")
     if not config.levels or not all(1 <= level <= 5 for level in config.levels):
         raise ValueError(f"levels={config.levels}: expected severities from 1 to 5")
-    kinds = config.kinds or SENSOR_FAILURES
+    kinds = config.kinds or FAILURES
     return [Cell(), *(Cell(kind, level) for kind in kinds for level in config.levels)]
 
 
@@ -220,13 +220,16 @@ def _means(found: dict[Cell, dict[str, float]], base: Any, kinds: Any) -> dict[s
 def _rows_of(
     training: Training, found: Any, base: Any, kinds: set[str | None]
 ) -> dict[str, dict[str, float]]:
-    """Rows of one training: single cells where it saw all kinds, else means of both groups."""
+    """Rows of one training: single cells where it saw all kinds, and means of groups."""
+    from fusion.detection.sensors import MISALIGNMENTS
+
+    apart, unseen = kinds & set(MISALIGNMENTS), kinds & set(training.unseen)
     if training.fold is None:
-        single = {cell.name: values for cell, values in found.items()}
-        return single | {"seen kinds": _means(found, base, kinds)}
-    unseen = kinds & set(training.unseen)
-    rows = {"clean (folds)": found[Cell()]}
-    groups = {"unseen kinds": unseen, "seen kinds (folds)": kinds - unseen}
+        rows = {cell.name: values for cell, values in found.items()}
+        groups = {"seen kinds": kinds - apart, "misaligned": apart}
+    else:
+        rows = {"clean (folds)": found[Cell()]}
+        groups = {"unseen kinds": unseen, "seen kinds (folds)": kinds - apart - unseen}
     return rows | {row: _means(found, base, group) for row, group in groups.items() if group}
 
 
@@ -274,7 +277,11 @@ def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
                 rows.append(cell | {"split": config.split} | summarize(values))
         base = held.get((row, "avod" if model == "avod_argate" else BASELINE), {})
         shared = sorted(base.keys() & by_seed.keys())
-        if row.startswith(("clean", "seen", "unseen")) and model != BASELINE and len(shared) > 1:
+        if (
+            row.startswith(("clean", "seen", "unseen", "misaligned"))
+            and model != BASELINE
+            and len(shared) > 1
+        ):
             other = "avod" if model == "avod_argate" else BASELINE
             a, b = ([scores[s][METRIC] for s in shared] for scores in (by_seed, base))
             comparison = {"row": row, "comparison": f"{model} - {other}", "metric": METRIC}

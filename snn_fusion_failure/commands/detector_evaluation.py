@@ -30,13 +30,12 @@ def evaluate(config: Eval) -> dict[str, Any]:
     from fusion.detection.learning.examples import Example
     from fusion.detection.learning.fitting import run_detector
     from fusion.detection.learning.scoring import Camera, frame_objects, weight_auroc
-    from fusion.detection.learning.training import SENSOR_FAILURES
+    from fusion.detection.learning.training import FAILURES
+    from fusion.detection.network.detector import SENSORS
     from fusion.detection.plots import plot_bird, plot_image
 
-    if config.failure is not None and config.failure not in SENSOR_FAILURES:
-        raise ValueError(
-            f"failure={config.failure!r}: expected one of {', '.join(SENSOR_FAILURES)}"
-        )
+    if config.failure is not None and config.failure not in FAILURES:
+        raise ValueError(f"failure={config.failure!r}: expected one of {', '.join(FAILURES)}")
     folder = config.run or run_folder(config)
     cache = open_cache(cache_folder(config))
     trained = run_config(folder, config)
@@ -94,7 +93,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
     if config.split != TESTING:
         widths = [float(camera.image_size[1]) for camera in cameras.values()]
         summary |= _score(config, names, objects, widths, out)
-    if config.failure and setup.config.weighs:
+    if (config.failure or "").startswith(SENSORS) and setup.config.weighs:
         path = _clean_weights(folder, config)
         if not path.exists():
             clean = run_detector(setup.config, state, examples(), seed=config.seed)

@@ -83,7 +83,7 @@ class Eval:
     run: Path | None = None
     """Run folder; named as in `train` when left out."""
     failure: str | None = None
-    """Sensor failure in every frame, e.g. camera_blackout, lidar_loss."""
+    """Failure in every frame, e.g. camera_blackout, lidar_loss, time_lag."""
     severity: float = 1.0
     overlap: float = 0.7
     """Least overlap of a hit."""

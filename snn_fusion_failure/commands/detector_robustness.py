@@ -75,14 +75,14 @@ def _prepare(config: Robustness, folder: Path, out: Path) -> Path:
 
 def robustness(config: Robustness) -> dict[str, Any]:
     """Evaluate what is missing, print the table, write `robustness.json`; returns its content."""
-    from fusion.detection.learning.training import SENSOR_FAILURES
+    from fusion.detection.learning.training import FAILURES
 
-    kinds = SENSOR_FAILURES if config.kinds is None else config.kinds
+    kinds = FAILURES if config.kinds is None else config.kinds
     if not kinds and not config.corrupted:
         raise ValueError("kinds=(): expected failures, or --corrupted folders")
-    unknown = [kind for kind in kinds if kind not in SENSOR_FAILURES]
+    unknown = [kind for kind in kinds if kind not in FAILURES]
     if unknown:
-        raise ValueError(f"kinds={unknown[0]!r}: expected of {', '.join(SENSOR_FAILURES)}")
+        raise ValueError(f"kinds={unknown[0]!r}: expected of {', '.join(FAILURES)}")
     if not config.levels or not all(1 <= level <= 5 for level in config.levels):
         raise ValueError(f"levels={config.levels}: expected severities from 1 to 5")
     held = None

@@ -57,6 +57,7 @@ from fusion.detection.learning.scoring import (
     weight_auroc,
 )
 from fusion.detection.learning.training import (
+    FAILURES,
     SENSOR_FAILURES,
     DetectorState,
     DetectorTrainConfig,
@@ -68,6 +69,7 @@ from fusion.detection.learning.training import (
 )
 
 __all__ = [
+    "FAILURES",
     "SENSOR_FAILURES",
     "TESTING",
     "Assignment",

@@ -6,8 +6,8 @@ r"""What training of the one-stage detector minimizes, and its detections.
 
 The heat has a focal loss over all cells, divided by the number of cars; the box an absolute error
 over the cells near one: a hit needs boxes right to a decimetre, where a smooth L1 hardly pulls.
-:math:`L^{aux}_k` is the same of a head that reads view k alone; the gate's terms
-are those of `gate_objective`.
+:math:`L^{aux}_k` is the same of a head that reads view k alone; the gate's terms are those of
+`gate_objective`.
 
 Source: Zhou, Wang, Kraehenbuehl (2019), Eq. 1; Shim (2020), Eq. 3.2.
 """

@@ -218,7 +218,7 @@ def run_detector(
         config: static.
         state: trained.
         examples: frames, taken one at a time.
-        failure: of `SENSOR_FAILURES`, the failure of one sensor in every frame; None for none.
+        failure: of `FAILURES`, in every frame; None for none.
         severity: of the failure; seed: of its noise, which depends on the frame's position too.
         on_frame: called with the number of frames done.
 

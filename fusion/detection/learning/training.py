@@ -31,6 +31,7 @@ from fusion.detection.sensors.lidar_failures import (
     lidar_failure,
     random_lidar_failure,
 )
+from fusion.detection.sensors.misalignment import MISALIGNMENTS, misaligned
 from fusion.targets import project_targets
 
 SENSOR_FAILURES: tuple[str, ...] = (
@@ -38,6 +39,8 @@ SENSOR_FAILURES: tuple[str, ...] = (
     *(f"lidar_{kind}" for kind in LIDAR_FAILURES),
 )
 """Names of single-sensor failures, `camera_blackout` and so on."""
+FAILURES: tuple[str, ...] = (*SENSOR_FAILURES, *MISALIGNMENTS)
+"""These, and the failures of both sensors together, which training never sees."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -169,23 +172,23 @@ def fail_sensor(
     *,
     key: PRNGKeyArray,
 ) -> Inputs:
-    """Inputs of one frame of which one sensor has failed, for tests of robustness.
+    """Inputs of one frame of which a sensor, or both together, have failed, to test robustness.
 
     Args:
         config: static.
         example: one frame.
-        failure: of `SENSOR_FAILURES` (static).
+        failure: of `FAILURES` (static).
         severity: in [0, 1].
         key: of the failure's noise.
 
     Raises:
         ValueError: unknown failure.
     """
-    if failure not in SENSOR_FAILURES:
-        raise ValueError(f"failure={failure!r}: expected one of {', '.join(SENSOR_FAILURES)}")
+    if failure not in FAILURES:
+        raise ValueError(f"failure={failure!r}: expected one of {', '.join(FAILURES)}")
     sensor, _, kind = failure.partition("_")
     told = jnp.asarray(severity, jnp.float32) * jnp.array(
-        [sensor == "camera", sensor == "lidar"], jnp.float32
+        [sensor != "lidar", sensor != "camera"], jnp.float32
     )
     if sensor == "camera":
         image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
@@ -193,6 +196,12 @@ def fail_sensor(
         failed_image = camera_failure(image, kind, severity, key=key, depth=depth)
         return make_inputs(config, example, image=failed_image, told=told)
     points, mask = jnp.asarray(example.points), jnp.asarray(example.point_mask)
+    if failure in MISALIGNMENTS:
+        to_camera, truth, labelled = (
+            jnp.asarray(a) for a in (example.to_camera, example.truth, example.truth_mask)
+        )
+        points = misaligned(points, mask, to_camera, truth, labelled, failure, severity, key=key)
+        return make_inputs(config, example, points=(points, mask), told=told)
     failed = lidar_failure(points, mask, kind, severity, key=key)
     return make_inputs(config, example, points=failed, told=told)
 

@@ -14,6 +14,7 @@ from fusion.detection.sensors.lidar_failures import (
     lidar_failure,
     random_lidar_failure,
 )
+from fusion.detection.sensors.misalignment import MISALIGNMENTS, Misalignment, misaligned
 from fusion.detection.sensors.quality import (
     N_IMAGE,
     N_SCAN,
@@ -29,12 +30,14 @@ __all__ = [
     "ELEVATIONS",
     "FARTHEST",
     "LIDAR_FAILURES",
+    "MISALIGNMENTS",
     "N_BEAMS",
     "N_IMAGE",
     "N_SCAN",
     "RANGE_NOISE",
     "CameraFailure",
     "LidarFailure",
+    "Misalignment",
     "Severity",
     "beam_of",
     "camera_failure",
@@ -42,6 +45,7 @@ __all__ = [
     "depth_image",
     "image_statistics",
     "lidar_failure",
+    "misaligned",
     "quality_statistics",
     "random_camera_failure",
     "random_lidar_failure",

@@ -14,8 +14,16 @@ from fusion.targets import TargetConfig
 DetectorModel = Literal["avod", "avod_argate", "dense", "dense_argate", "dense_oracle"]
 DETECTORS: tuple[str, ...] = get_args(DetectorModel)
 
-# k-means of the 14,357 labelled cars of the usual training list: length, width, height [m].
+Precision = Literal["float32", "bfloat16"]
+Target = Literal["Car", "Pedestrian", "Cyclist"]
+TARGETS: tuple[str, ...] = get_args(Target)
+# k-means of the 14,357, 2,207 and 734 labels of the usual training list: length, width, height [m].
 CAR_SIZES = ((3.513, 1.581, 1.511), (4.234, 1.653, 1.546))
+TARGET_SIZES = {
+    "Car": CAR_SIZES,
+    "Pedestrian": ((0.582, 0.624, 1.721), (1.0, 0.631, 1.804)),
+    "Cyclist": ((1.659, 0.484, 1.687), (1.889, 0.661, 1.761)),
+}
 
 
 @dataclasses.dataclass(frozen=True)
@@ -66,6 +74,7 @@ class DetectorConfig:
         model: `avod` (mean fusion) or `avod_argate` (fusion weights), in two stages; `dense` or
             `dense_argate`, in one stage on a grid over the ground; `dense_oracle`, whose gate is
             told which sensor fails and how severely.
+        target: the class that is told from the background; set by the cache, like the anchor sizes.
         dense: sizes of the latter three, which share with AVOD what is about area, image, labels,
             gate and paths.
         fixed_weights: of (camera, lidar), in place of the network's; `dense` models only. (1, 0)
@@ -74,6 +83,8 @@ class DetectorConfig:
         image_size: rows and columns that images are resized to.
         max_points, max_objects: fixed sizes of scan and labels.
         widths: channels of the encoder's four levels; layers: convolutions on each.
+        precision: of the convolutions, `float32` or `bfloat16`, for accelerators; parameters,
+            normalization, heads and losses are float32 in any case.
         norm: `batch` or `group`; with one frame a batch, group norm is the steadier one.
         rpn_width, rpn_crop: units of the first stage's two towers, side of its crops.
         fc_widths, second_crop: fully connected layers of the second stage, side of its crops.
@@ -105,6 +116,7 @@ class DetectorConfig:
     """
 
     model: DetectorModel = "avod_argate"
+    target: Target = "Car"
     dense: DenseConfig = dataclasses.field(default_factory=DenseConfig)
     bev: BevConfig = dataclasses.field(default_factory=BevConfig)
     anchors: AnchorConfig = dataclasses.field(default_factory=lambda: AnchorConfig(CAR_SIZES))
@@ -113,6 +125,7 @@ class DetectorConfig:
     max_objects: int = 32
     widths: tuple[int, ...] = (32, 64, 128, 256)
     layers: tuple[int, ...] = (2, 2, 3, 3)
+    precision: Precision = "float32"
     norm: Literal["batch", "group"] = "batch"
     rpn_width: int = 256
     rpn_crop: int = 3
@@ -150,8 +163,12 @@ class DetectorConfig:
         """Refuse what cannot be built."""
         if self.model not in DETECTORS:
             raise ValueError(f"model={self.model!r}: expected one of {', '.join(DETECTORS)}")
+        if self.target not in TARGETS:
+            raise ValueError(f"target={self.target!r}: expected one of {', '.join(TARGETS)}")
         if self.norm not in ("batch", "group"):
             raise ValueError(f"norm={self.norm!r}: expected 'batch' or 'group'")
+        if self.precision not in get_args(Precision):
+            raise ValueError(f"precision={self.precision!r}: expected 'float32' or 'bfloat16'")
         if self.normalizer not in get_args(Normalizer):
             raise ValueError(
                 f"normalizer={self.normalizer!r}: expected one of {', '.join(get_args(Normalizer))}"

@@ -30,6 +30,13 @@ def _corners(objects: Objects) -> np.ndarray:
     return np.asarray(box_corners(jnp.asarray(boxes, jnp.float32)), np.float64)
 
 
+def _labelled(frame: Frame, detections: Objects) -> Objects:
+    """Labels of the classes that are detected, cars where nothing is."""
+    assert frame.labels is not None
+    names = set(detections.type.tolist()) or {"Car"}
+    return select(frame.labels, np.isin(frame.labels.type, sorted(names)))
+
+
 def _draw_ground(axes: Axes, objects: Objects, colour: str, label: str) -> None:
     for i, corners in enumerate(_corners(objects)):
         ground = corners[[0, 1, 2, 3, 0]][:, [0, 2]]
@@ -50,7 +57,7 @@ def _draw_bird(
     x, z = points[inside, 0], points[inside, 2]
     axes.scatter(x, z, s=0.2, color="0.55", linewidths=0, rasterized=True)
     if frame.labels is not None:
-        _draw_ground(axes, select(frame.labels, frame.labels.type == "Car"), TRUTH, "label")
+        _draw_ground(axes, _labelled(frame, detections), TRUTH, "label")
     _draw_ground(axes, detections, FOUND, "detection")
     axes.set(xlim=x_range, ylim=z_range, xlabel="x [m]", ylabel="z [m]", aspect="equal")
     axes.set_title(f"frame {frame.name}", fontsize=10)
@@ -63,7 +70,7 @@ def _draw_image(axes: Axes, frame: Frame, detections: Objects) -> None:
     axes.imshow(frame.image)
     groups = [(detections, FOUND)]
     if frame.labels is not None:
-        groups.insert(0, (select(frame.labels, frame.labels.type == "Car"), TRUTH))
+        groups.insert(0, (_labelled(frame, detections), TRUTH))
     for objects, colour in groups:
         for corners in _corners(objects):
             pixels, depth = project(frame.calibration, corners)

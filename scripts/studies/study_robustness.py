@@ -79,8 +79,8 @@ class Config:
     """Group of failures that training does not see."""
     split: Literal["val", "test"] = "val"
     """Frames to evaluate: `val` to choose settings, `test` for the numbers of record."""
-    overlap: float = 0.7
-    """Least overlap of a hit."""
+    overlap: float | None = None
+    """Least overlap of a hit; the benchmark's when left out."""
     any_size: bool = False
     """Accept images of other sizes than the benchmark's (simulated frames)."""
     changes: choices.Changes = ()

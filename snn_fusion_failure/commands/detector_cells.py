@@ -64,7 +64,7 @@ def measure_cells(
     cells: Sequence[Cell],
     folder: Path,
     *,
-    overlap: float = 0.7,
+    overlap: float | None = None,
     seed: int = 0,
 ) -> int:
     """Measure the cells that `folder` does not hold, one file each; returns how many were missing.
@@ -74,13 +74,13 @@ def measure_cells(
         frames: as from `read_frames`.
         cells: what to measure, the clean cell first.
         folder: of `clean.json`, `camera_fog_3.json` and so on.
-        overlap: least overlap of a hit.
+        overlap: least overlap of a hit; the benchmark's when left out.
         seed: of the failures' noise, the same for all detectors that are to be compared.
     """
     import numpy as np
 
     from fusion.detection.learning.fitting import run_detector
-    from fusion.detection.learning.scoring import car_precision, frame_objects, precision_fields
+    from fusion.detection.learning.scoring import class_precision, frame_objects, precision_fields
 
     widths = [float(camera.image_size[1]) for camera in frames.cameras]
     missing = [cell for cell in cells if not _path(folder, cell).exists()]
@@ -97,8 +97,10 @@ def measure_cells(
             severity=cell.level / 5,
             seed=seed,
         )
-        objects = frame_objects(found, frames.cameras)
-        scored = car_precision(frames.labels, objects, widths, min_overlap=overlap)
+        objects = frame_objects(found, frames.cameras, config.target)
+        scored = class_precision(
+            frames.labels, objects, widths, target=config.target, min_overlap=overlap
+        )
         failed = np.stack([d.failed for d in found])
         record = {
             METRIC: precision_fields(scored)[METRIC],

@@ -72,7 +72,8 @@ def evaluate(config: Eval) -> dict[str, Any]:
             seed=config.seed,
             on_frame=show,
         )
-    objects = frame_objects(found, list(cameras.values()))
+    target = setup.config.target
+    objects = frame_objects(found, list(cameras.values()), target)
     for name, detections in zip(names, objects, strict=True):
         write_results(out / "data" / f"{name}.txt", detections)
     weights = np.stack([d.weights for d in found])
@@ -92,7 +93,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
     }
     if config.split != TESTING:
         widths = [float(camera.image_size[1]) for camera in cameras.values()]
-        summary |= _score(config, names, objects, widths, out)
+        summary |= _score(config, target, names, objects, widths, out)
     if (config.failure or "").startswith(SENSORS) and setup.config.weighs:
         path = _clean_weights(folder, config)
         if not path.exists():
@@ -117,23 +118,31 @@ def evaluate(config: Eval) -> dict[str, Any]:
 
 
 def _score(
-    config: Eval, names: tuple[str, ...], objects: list[Any], widths: list[float], out: Path
+    config: Eval,
+    target: str,
+    names: tuple[str, ...],
+    objects: list[Any],
+    widths: list[float],
+    out: Path,
 ) -> dict[str, Any]:
     """Average precisions at both overlaps, and the curves as a picture."""
     from fusion.detection.kitti.average_precision import average_precision_cap
     from fusion.detection.kitti.files import read_labels
-    from fusion.detection.learning.scoring import car_precision, precision_fields
+    from fusion.detection.learning.scoring import class_precision, precision_fields
     from fusion.detection.plots import plot_precision
 
     folder = config.data / "training" / "label_2"
     labels = [read_labels(folder / f"{name}.txt") for name in names]
-    scored = car_precision(labels, objects, widths, min_overlap=config.overlap)
-    loose = car_precision(labels, objects, widths, min_overlap=config.loose_overlap)
+    loose_overlap = config.loose_overlap or (0.5 if target == "Car" else 0.25)
+    scored, loose = (
+        class_precision(labels, objects, widths, target=target, min_overlap=overlap)
+        for overlap in (config.overlap, loose_overlap)
+    )
     plot_precision({config.model: scored}).savefig(out / "precision.png", dpi=120)
     # The benchmark's looser variant counts boxes on the ground and in 3D; images stay at 0.7.
-    suffix = f"_iou{100 * config.loose_overlap:.0f}"
+    suffix = f"_iou{100 * loose_overlap:.0f}"
     return {
-        "cars": scored.n_objects[0],
+        "objects" if target != "Car" else "cars": scored.n_objects[0],
         "cap_moderate_r40": average_precision_cap(int(scored.n_objects[0, 1]), 40),
         **precision_fields(scored),
         **{

@@ -4,6 +4,8 @@
     python scripts/train_detector.py train --data ROOT --model avod_argate --size small --failures
     python scripts/train_detector.py eval --data ROOT --model avod_argate --size small \
         --failures --failure camera_blackout
+    python scripts/train_detector.py drive --data ROOT --model dense_argate --size small \
+        --failures --failure camera_fog
     python scripts/train_detector.py robustness --data ROOT --model avod_argate --size small \
         --failures
 
@@ -14,8 +16,9 @@ writes checkpoints and can `--resume`; `eval` writes result files in KITTI's for
 curves, pictures from above and of the image, and ends with a line `result: ...`. `--split testing`
 takes the frames of ROOT/testing (no labels, hence result files and no score). `robustness` repeats
 `eval` for every failure at severities 1 to 5 and for corrupted copies of the frames
-(`--corrupted`), and prints a table with the mean relative precision (mRA). `small` is for two
-CPU cores (minutes), `paper` for an accelerator (see docs/kitti.md).
+(`--corrupted`), and prints a table with the mean relative precision (mRA). `drive` simulates a
+drive on which a sensor dies and draws what it reads, what is found and what the gate says. `small`
+is for two CPU cores (minutes), `paper` for an accelerator (see docs/kitti.md).
 """
 
 from __future__ import annotations
@@ -27,8 +30,9 @@ from typing import Annotated, Any
 
 import tyro
 
+from snn_fusion_failure.commands.detector_drive import drive
 from snn_fusion_failure.commands.detector_evaluation import evaluate
-from snn_fusion_failure.commands.detector_options import Eval, Prepare, Robustness, Train
+from snn_fusion_failure.commands.detector_options import Drive, Eval, Prepare, Robustness, Train
 from snn_fusion_failure.commands.detector_robustness import robustness
 from snn_fusion_failure.commands.detector_runs import (
     NOT_SETTINGS,
@@ -64,6 +68,7 @@ def prepare(config: Prepare) -> dict[str, Any]:
             add=config.add or config.splits[:1] == (TESTING,),
             like=open_cache(config.like) if config.like else None,
             any_size=config.any_size,
+            target=config.target,
             skip_bad=config.skip_bad,
             ground=PlaneConfig(camera_height=config.camera_height, max_tilt=config.camera_tilt),
             on_frame=lambda done, n, name: bar.update(task, total=n, completed=done, status=name),
@@ -149,13 +154,16 @@ def train(config: Train) -> dict[str, Any]:
     return result
 
 
-def main(config: Prepare | Train | Eval | Robustness) -> dict[str, Any]:
-    """Run one of the four commands."""
+def main(config: Prepare | Train | Eval | Drive | Robustness) -> dict[str, Any]:
+    """Run one of the five commands."""
     if isinstance(config, Prepare):
         result = prepare(config)
         shown = result
     elif isinstance(config, Train):
         result = train(config)
+        shown = result
+    elif isinstance(config, Drive):
+        result = drive(config)
         shown = result
     elif isinstance(config, Robustness):
         result = robustness(config)
@@ -177,6 +185,7 @@ Command = (
     Annotated[Prepare, tyro.conf.subcommand("prepare")]
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
+    | Annotated[Drive, tyro.conf.subcommand("drive")]
     | Annotated[Robustness, tyro.conf.subcommand("robustness")]
 )
 

@@ -149,6 +149,7 @@ RULES = (
     Rule("train_detector.py prepare", "--size tiny --any-size"),
     Rule("train_detector.py train", "--size tiny --steps 1 --overwrite"),
     Rule("train_detector.py eval", "--size tiny --pictures 1"),
+    Rule("train_detector.py drive", "--size tiny --frames 2"),
     Rule("evaluate_kitti.py"),
     Rule(
         "study_detector.py",

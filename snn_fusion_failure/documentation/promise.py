@@ -38,6 +38,7 @@ BY_PATH = {
     "fusion.spiking.exchange": "spiking encoders as NIR graphs",
     "fusion.lattice.plots": "pictures (matplotlib)",
     "fusion.detection.kitti": "files of KITTI and the official score",
+    "fusion.detection.learning.portable": "detectors as programs, for processes without this package",
     "fusion.detection.plots": "pictures (matplotlib)",
     "failure.rev_argate": "Rev-ARGate (brings the fusion package along)",
     "failure.revnet": "invertible networks",

@@ -14,7 +14,7 @@ from fusion.detection.config import DenseConfig, DetectorConfig
 from fusion.detection.geometry.bev import BevConfig
 from fusion.detection.learning.dense_objective import grid_losses
 from fusion.detection.learning.dense_targets import GridTargets, decode_cells, grid_targets
-from fusion.detection.learning.examples import make_example
+from fusion.detection.learning.examples import make_example, make_inputs
 from fusion.detection.learning.fitting import fit_detector, run_detector
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.training import DetectorTrainConfig, fail_sensor
@@ -119,6 +119,28 @@ def test_only_the_oracle_is_told() -> None:
     np.testing.assert_array_equal(alone.weights, [[1.0, 0.0]])
     with pytest.raises(ValueError, match="expected none with model='avod'"):
         dataclasses.replace(TINY, model="avod", fixed_weights=(1.0, 0.0))
+
+
+@pytest.mark.slow
+def test_low_precision_is_the_same_network_rounded() -> None:
+    example, _ = make_example(TINY, a_frame())
+    config = dataclasses.replace(TINY, model="dense")
+    x = jax.tree.map(lambda a: a[None], jax.jit(partial(make_inputs, config))(example))
+    params, _ = jax.jit(partial(init_detector, config=config))(jax.random.key(0))
+    # Outputs start near zero.
+    main = jax.tree.map(lambda a: a + 0.1 * jnp.sin(jnp.arange(a.size)).reshape(a.shape),
+                        params["main"])  # fmt: skip
+
+    def run(precision: str) -> np.ndarray:
+        network = DenseDetector(dataclasses.replace(config, precision=precision))
+        found = jax.jit(network.apply)({"params": main}, x)
+        assert found.dtype == jnp.float32
+        return np.asarray(found)
+
+    exact, low = run("float32"), run("bfloat16")
+    error = np.abs(exact - low)
+    # Eight bits of mantissa: a rounding of 0.4 % in every layer.
+    assert 1e-4 < error.max() < 0.05 and np.abs(exact).max() > 1.0
 
 
 @pytest.mark.relaxed

@@ -43,7 +43,7 @@ from fusion.detection.learning.gate_objective import gate_terms, path_losses
 from fusion.detection.learning.inference import to_objects
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.sampling import Assignment, Sample, assign, draw
-from fusion.detection.learning.scoring import car_precision, image_scale, weight_auroc
+from fusion.detection.learning.scoring import class_precision, image_scale, weight_auroc
 from fusion.detection.learning.training import (
     SENSOR_FAILURES,
     DetectorTrainConfig,
@@ -337,7 +337,7 @@ def test_detections_become_kitti_objects() -> None:
     # In pixels of the benchmark the labels are 23 * 12.9 and 17 * 12.9 high: all count.
     assert image_scale(1242.0) == 1.0 and image_scale(96.0) == 1242 / 96
     exact = dataclasses.replace(objects, bbox=frame.labels.bbox, alpha=frame.labels.alpha)
-    scored = car_precision([frame.labels], [exact], [96.0])
+    scored = class_precision([frame.labels], [exact], [96.0])
     assert scored.n_objects.tolist() == [[2, 2, 2]] and scored.precision[0, 3, 1, 1] == 1.0
     assert weight_auroc(np.array([[0.5, 0.5]] * 4), np.array([[0.2, 0.8]] * 4), 0) == 1.0
 

@@ -30,6 +30,7 @@ from fusion.detection.learning.examples import (
 )
 from fusion.detection.learning.fitting import (
     DetectorFit,
+    failed_inputs,
     fit_detector,
     frame_order,
     restore_detector,
@@ -50,7 +51,7 @@ from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.sampling import Assignment, Sample, assign, draw
 from fusion.detection.learning.scoring import (
     Camera,
-    car_precision,
+    class_precision,
     frame_objects,
     image_scale,
     precision_fields,
@@ -88,9 +89,9 @@ __all__ = [
     "StageLoss",
     "assign",
     "balanced_class_loss",
-    "car_precision",
     "class_loss",
     "class_losses",
+    "class_precision",
     "decode_cells",
     "dense_detect",
     "dense_loss",
@@ -98,6 +99,7 @@ __all__ = [
     "detector_loss",
     "draw",
     "fail_sensor",
+    "failed_inputs",
     "failure_loss",
     "fit_detector",
     "flip",

@@ -12,11 +12,11 @@ import json
 import os
 from collections.abc import Callable, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
-from fusion.detection.config import CAR_SIZES, DetectorConfig
+from fusion.detection.config import TARGET_SIZES, TARGETS, DetectorConfig, Target
 from fusion.detection.geometry.anchors import cluster_sizes
 from fusion.detection.geometry.planes import PlaneConfig
 from fusion.detection.kitti.files import frame_names, read_frame, read_labels, read_split
@@ -47,6 +47,7 @@ class Cache:
         splits: split name -> frame names.
         sizes: anchor sizes [m], from the training labels.
         counts: frames fitted, skipped, missing; points and labels left out.
+        target: class of the labels that the examples hold.
     """
 
     folder: Path
@@ -55,13 +56,16 @@ class Cache:
     splits: dict[str, tuple[str, ...]]
     sizes: tuple[tuple[float, float, float], ...]
     counts: dict[str, Any]
+    target: Target = "Car"
 
     def config(self, model: str) -> DetectorConfig:
-        """The detector of this size with this cache's anchor sizes."""
+        """The detector of this size with this cache's class and anchor sizes."""
         base = preset(self.size, model).config
-        return dataclasses.replace(
-            base, anchors=dataclasses.replace(base.anchors, sizes=self.sizes)
-        )
+        anchors = dataclasses.replace(base.anchors, sizes=self.sizes)
+        made = dataclasses.replace(base, target=self.target, anchors=anchors)
+        # Few anchors overlap a small object by as much as one overlaps a car.
+        limits = {"rpn_iou": (0.3, 0.45), "second_iou": (0.45, 0.55)}
+        return made if self.target == "Car" else dataclasses.replace(made, **limits)  # type: ignore[arg-type]
 
     def read(self, split: str) -> list[Example]:
         """All examples of a split, in memory."""
@@ -146,18 +150,18 @@ def split_frames(root: Path, splits: Sequence[str]) -> tuple[dict[str, tuple[str
 
 
 def _anchor_sizes(
-    root: Path, names: Sequence[str], n_sizes: int
+    root: Path, names: Sequence[str], n_sizes: int, target: str
 ) -> tuple[tuple[float, float, float], ...]:
     sizes = [np.zeros((0, 3))]
     for name in names:
         labels = read_labels(root / "training" / "label_2" / f"{name}.txt")
-        cars = (labels.type == "Car") & (labels.dimensions > 0).all(axis=1)
-        sizes.append(labels.dimensions[cars][:, [2, 1, 0]])
-    cars = np.concatenate(sizes)
-    # Clusters of a handful of cars mean nothing; the benchmark's own are the better guess.
-    if len(np.unique(cars, axis=0)) < 20 * n_sizes:
-        return CAR_SIZES[-n_sizes:]
-    centres = np.round(cluster_sizes(cars, n_sizes), 3)
+        wanted = (labels.type == target) & (labels.dimensions > 0).all(axis=1)
+        sizes.append(labels.dimensions[wanted][:, [2, 1, 0]])
+    labelled = np.concatenate(sizes)
+    # Clusters of a handful of objects mean nothing; the benchmark's own are the better guess.
+    if len(np.unique(labelled, axis=0)) < 20 * n_sizes:
+        return TARGET_SIZES[target][-n_sizes:]
+    centres = np.round(cluster_sizes(labelled, n_sizes), 3)
     return tuple((float(a), float(b), float(c)) for a, b, c in centres)
 
 
@@ -208,6 +212,7 @@ def prepare_cache(
     any_size: bool = False,
     skip_bad: bool = False,
     ground: PlaneConfig | None = None,
+    target: str = "Car",
     on_frame: Callable[[int, int, str], None] | None = None,
 ) -> Cache:
     """Read every frame of the split lists, check it, and write its example.
@@ -223,6 +228,7 @@ def prepare_cache(
         any_size: accept images of other sizes than the benchmark's.
         skip_bad: leave out frames that cannot be used, and count them, instead of stopping.
         ground: where ground planes are looked for; the benchmark's car when left out.
+        target: class of the labels; that of the cache to add to, or to be like, counts first.
         on_frame: called with (done, all, name).
 
     Raises:
@@ -232,8 +238,12 @@ def prepare_cache(
             add to has another size or one of the lists; or `testing`, which has no labels, would
             have to give the anchor sizes.
     """
-    config = preset(size).config
+    if target not in TARGETS:
+        raise ValueError(f"target={target!r}: expected one of {', '.join(TARGETS)}")
     held = open_cache(folder) if add else None
+    other = held or like
+    wanted = cast(Target, target) if other is None else other.target
+    config = dataclasses.replace(preset(size).config, target=wanted)
     if held is not None and (held.size != size or set(splits) & set(held.splits)):
         raise ValueError(
             f"{folder} has size {held.size!r} and the splits {', '.join(held.splits)}: cannot "
@@ -273,12 +283,12 @@ def prepare_cache(
     if like is not None:
         sizes = like.sizes
     elif held is None:
-        sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes))
+        sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes), wanted)
     else:
         sizes, kept = held.sizes, held.splits | kept
         skipped = held.counts["skipped"] | counts.pop("skipped")
         counts = {k: n + held.counts[k] for k, n in counts.items()} | {"skipped": skipped}
-    cache = Cache(folder, root, size, kept, sizes, counts)
+    cache = Cache(folder, root, size, kept, sizes, counts, wanted)
     record = dataclasses.asdict(cache) | {"folder": str(folder), "root": str(root)}
     temporary = folder / ".cache.json"
     temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
@@ -299,4 +309,5 @@ def open_cache(folder: Path) -> Cache:
         splits={split: tuple(names) for split, names in held["splits"].items()},
         sizes=tuple((a, b, c) for a, b, c in held["sizes"]),
         counts=held["counts"],
+        target=held.get("target", "Car"),
     )

@@ -38,7 +38,7 @@ class Example(NamedTuple):
         p2: `[3, 4]` projection into the image of the original size.
         image_size: `[2]` original rows and columns.
         plane: `[4]` ground plane.
-        truth, truth_mask: `[g, 7]` boxes of the labelled cars in the area, padded.
+        truth, truth_mask: `[g, 7]` labelled boxes of the target class in the area, padded.
     """
 
     image: np.ndarray | Array
@@ -132,7 +132,7 @@ def make_example(
         # No anchor stands outside the area, and no feature map reaches there.
         inside = (at_x > x[0]) & (at_x < x[1]) & (at_z > z[0]) & (at_z < z[1])
         solid = (labels.dimensions > 0).all(axis=1)
-        cars = np.flatnonzero((labels.type == "Car") & solid & inside)
+        cars = np.flatnonzero((labels.type == config.target) & solid & inside)
         cars = cars[np.argsort(labels.location[cars, 2], kind="stable")]
         lost = max(0, len(cars) - config.max_objects)
         cars = cars[: config.max_objects]

@@ -197,6 +197,25 @@ def _inputs(config: DetectorConfig, failure: str | None) -> Callable[..., Inputs
     return jax.jit(run)
 
 
+def failed_inputs(
+    config: DetectorConfig,
+    example: Example,
+    *,
+    failure: str | None = None,
+    severity: float = 1.0,
+    seed: int = 0,
+    position: int = 0,
+) -> Inputs:
+    """What `run_detector` lets the network read of the frame at a position, a batch of one."""
+    # Models with and without a gate read the same inputs.
+    plain = dataclasses.replace(
+        config, model="dense" if config.is_dense else "avod", fixed_weights=None
+    )
+    key = jax.random.fold_in(jax.random.key(seed), position)
+    made: Inputs = _inputs(plain, failure)(key, example, jnp.float32(severity))
+    return made
+
+
 @functools.lru_cache(maxsize=8)
 def _detect(config: DetectorConfig) -> Callable[..., Detections]:
     return jax.jit(functools.partial(dense_detect if config.is_dense else detect, config))
@@ -225,13 +244,12 @@ def run_detector(
     Returns:
         One `Detections` per frame, in order.
     """
-    # Models with and without a gate read the same inputs.
-    plain = dataclasses.replace(config, model="dense" if config.is_dense else "avod")
-    read, run = _inputs(plain, failure), _detect(config)
-    key = jax.random.key(seed)
+    run = _detect(config)
     out = []
     for i, example in enumerate(examples):
-        inputs = read(jax.random.fold_in(key, i), example, jnp.float32(severity))
+        inputs = failed_inputs(
+            config, example, failure=failure, severity=severity, seed=seed, position=i
+        )
         found = run(state.params["main"], state.stats, inputs)
         found = jax.tree.map(lambda a: a[0], found)
         out.append(jax.device_get(found))

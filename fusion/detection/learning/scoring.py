@@ -9,7 +9,13 @@ from typing import NamedTuple
 import numpy as np
 from jaxtyping import Float
 
-from fusion.detection.kitti.average_precision import DIFFICULTIES, METRICS, Evaluation, evaluate
+from fusion.detection.kitti.average_precision import (
+    DIFFICULTIES,
+    METRICS,
+    MIN_OVERLAP,
+    Evaluation,
+    evaluate,
+)
 from fusion.detection.kitti.objects import Objects
 from fusion.detection.learning.inference import to_objects
 from fusion.detection.network.proposals import Detections
@@ -35,10 +41,12 @@ class Camera(NamedTuple):
     image_size: np.ndarray
 
 
-def frame_objects(detections: Sequence[Detections], cameras: Sequence[Camera]) -> list[Objects]:
+def frame_objects(
+    detections: Sequence[Detections], cameras: Sequence[Camera], target: str = "Car"
+) -> list[Objects]:
     """Detections of each frame in KITTI's terms, in pixels of the frame's own image."""
     return [
-        to_objects(found, np.asarray(camera.p2), np.asarray(camera.image_size))
+        to_objects(found, np.asarray(camera.p2), np.asarray(camera.image_size), target)
         for found, camera in zip(detections, cameras, strict=True)
     ]
 
@@ -47,19 +55,22 @@ def _scaled(objects: Objects, factor: float) -> Objects:
     return dataclasses.replace(objects, bbox=objects.bbox * factor)
 
 
-def car_precision(
+def class_precision(
     labels: Sequence[Objects],
     detections: Sequence[Objects],
     widths: Sequence[float],
     *,
-    min_overlap: float = 0.7,
+    target: str = "Car",
+    min_overlap: float | None = None,
 ) -> Evaluation:
-    """Precision curves of cars, in pixels of the benchmark.
+    """Precision curves of one class, in pixels of the benchmark.
 
     Args:
         labels, detections: of the same frames.
         widths: width of each frame's image [pixel], see `image_scale`.
-        min_overlap: in 2D, on the ground and in 3D; the benchmark's is 0.7.
+        target: the class.
+        min_overlap: in 2D, on the ground and in 3D; the benchmark's (0.7 for cars, 0.5 for others)
+            when left out.
 
     Raises:
         ValueError: like `fusion.detection.kitti.average_precision.evaluate`.
@@ -68,13 +79,13 @@ def car_precision(
     return evaluate(
         [_scaled(o, s) for o, s in zip(labels, scales, strict=True)],
         [_scaled(o, s) for o, s in zip(detections, scales, strict=True)],
-        classes=("Car",),
-        min_overlap={"Car": min_overlap},
+        classes=(target,),
+        min_overlap={target: MIN_OVERLAP[target] if min_overlap is None else min_overlap},
     )
 
 
 def precision_fields(evaluation: Evaluation) -> dict[str, float]:
-    """Average precision [%] of cars: `3d_moderate_r40` and so on, all metrics and difficulties."""
+    """Average precision [%]: `3d_moderate_r40` and so on, all metrics and difficulties."""
     out = {}
     for points in (11, 40):
         table = evaluation.average_precision(points)[0]

@@ -90,12 +90,16 @@ _narrow.defvjp(_narrow_fwd, _narrow_bwd)
 
 
 def convolve(
-    x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"]
+    x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"], precision: str = "float32"
 ) -> Float[Array, "b h w f"]:
     """3x3 convolution of stride one, with zeros around the map; gradients in reverse mode.
 
     Args:
         x: maps.
         kernel: weights.
+        precision: of both factors; the result has that of `x` again.
     """
+    if precision == "bfloat16":
+        low = jnp.bfloat16
+        return _apply(x.astype(low), kernel.astype(low), (1, 1), 1).astype(x.dtype)
     return _apply(x, kernel, (1, 1), 1) if kernel.shape[-1] >= _WIDE else _narrow(x, kernel)

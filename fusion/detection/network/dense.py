@@ -12,6 +12,7 @@ CenterPoint; the gate, Shim (2020), section 3.3.2.2. Widths are our choice.
 
 from __future__ import annotations
 
+import functools
 import math
 from typing import Any, NamedTuple
 
@@ -27,6 +28,7 @@ from fusion.detection.network.heads import GridGate, QualityHead
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.lifting import lift
+from fusion.detection.network.views import SameConv
 from fusion.detection.sensors.quality import quality_statistics
 from fusion.targets import init_targets
 
@@ -56,15 +58,20 @@ class _Block(nn.Module):
     features: int
     stride: int = 1
     size: int = 3
+    precision: str = "float32"
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
-        conv = nn.Conv(
-            self.features, (self.size,) * 2, strides=(self.stride,) * 2, use_bias=False, name="conv"
-        )
+        if self.stride == 1 and self.size == 3:
+            y = SameConv(self.features, self.precision, name="conv")(x)
+        else:
+            sides = (self.size,) * 2, (self.stride,) * 2
+            dtype = jnp.dtype(self.precision)
+            conv = nn.Conv(self.features, *sides, use_bias=False, dtype=dtype, name="conv")
+            y = conv(x).astype(x.dtype)
         scale = self.param("scale", nn.initializers.ones, (self.features,))
         bias = self.param("bias", nn.initializers.zeros, (self.features,))
-        return group_norm_relu(conv(x), scale, bias)
+        return group_norm_relu(y, scale, bias)
 
 
 class _Output(nn.Module):
@@ -97,20 +104,21 @@ class DenseDetector(nn.Module):
         c, d = self.config, self.config.dense
         stride = round(d.cell / c.bev.cell)
         size = 3 if stride <= 2 else stride + 1 - stride % 2
-        self.lidar = [_Block(d.lidar_width, stride, size), _Block(d.lidar_width)]
+        block = functools.partial(_Block, precision=c.precision)
+        self.lidar = [block(d.lidar_width, stride, size), block(d.lidar_width)]
         half, quarter = d.camera_widths
-        self.near = [_Block(half, 2), _Block(half)]
-        self.wide = [_Block(quarter, 2), _Block(quarter)]
-        self.joined, self.lifted = _Block(half), _Block(half, size=1)
+        self.near = [block(half, 2), block(half)]
+        self.wide = [block(quarter, 2), block(quarter)]
+        self.joined, self.lifted = block(half), block(half, size=1)
         if c.weighs:
             self.gate = GridGate(c.gate_width, c.normalizer)
             if c.gated and c.gate_statistics:
                 self.quality = QualityHead(c.gate_width)
         top, low = d.trunk_widths
-        self.fused = [_Block(top), _Block(top)]
-        self.down = [_Block(low, 2), _Block(low), _Block(low)]
-        self.bottom = [_Block(low, 2), _Block(low)]
-        self.up = [_Block(top, size=1), _Block(top), _Block(top)]
+        self.fused = [block(top), block(top)]
+        self.down = [block(low, 2), block(low), block(low)]
+        self.bottom = [block(low, 2), block(low)]
+        self.up = [block(top, size=1), block(top), block(top)]
         self.output = _Output()
 
     def encode(self, inputs: Inputs) -> Grids:
@@ -175,7 +183,7 @@ class DenseAuxiliary(nn.Module):
         found = []
         for sensor, x in (("camera", camera), ("lidar", lidar)):
             for i in range(2):
-                x = _Block(top, name=f"{sensor}{i}")(x)
+                x = _Block(top, precision=self.config.precision, name=f"{sensor}{i}")(x)
             found.append(_Output(name=f"{sensor}_output")(x))
         return found[0], found[1]
 

@@ -56,7 +56,8 @@ class Detector(nn.Module):
         """Both views, the gate of `avod_argate`, both stages' heads."""
         c = self.config
         self.views = [
-            FeaturePyramid(c.widths, c.layers, c.norm, name=f"{sensor}_view") for sensor in SENSORS
+            FeaturePyramid(c.widths, c.layers, c.norm, c.precision, name=f"{sensor}_view")
+            for sensor in SENSORS
         ]
         self.reduce = [nn.Conv(1, (1, 1), name=f"{sensor}_map") for sensor in SENSORS]
         if c.gated:

@@ -15,15 +15,18 @@ from fusion.detection.network.convolution import convolve
 from fusion.detection.network.group_norm import group_norm_relu
 
 
-class _Conv(nn.Module):
+class SameConv(nn.Module):
     """3x3 convolution without bias, zeros around the map."""
 
     features: int
+    precision: str = "float32"
 
     @nn.compact
-    def __call__(self, x: Array) -> Array:
+    def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h w f"]:
+        """The maps convolved."""
         shape = (3, 3, x.shape[-1], self.features)
-        return convolve(x, self.param("kernel", nn.initializers.he_normal(), shape))
+        kernel = self.param("kernel", nn.initializers.he_normal(), shape)
+        return convolve(x, kernel, self.precision)
 
 
 class TransposedConv(nn.Module):
@@ -35,6 +38,7 @@ class TransposedConv(nn.Module):
     """
 
     features: int
+    precision: str = "float32"
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"]) -> Float[Array, "b h2 w2 f"]:
@@ -48,14 +52,15 @@ class TransposedConv(nn.Module):
                                         jnp.array([0, 1, 1])].set(1.0)  # fmt: skip
         phases = jnp.einsum("mta,nub,mncf->tucabf", along, along, kernel)
         padded = jnp.pad(x, ((0, 0), (0, 1), (0, 1), (0, 0)))
+        dtype = jnp.dtype(self.precision)
         y = jax.lax.conv_general_dilated(
-            padded,
-            phases.reshape(2, 2, c, 4 * f),
+            padded.astype(dtype),
+            phases.reshape(2, 2, c, 4 * f).astype(dtype),
             (1, 1),
             "VALID",
             dimension_numbers=("NHWC", "HWIO", "NHWC"),
         )
-        y = y.reshape(b, h, w, 2, 2, f).transpose(0, 1, 3, 2, 4, 5)
+        y = y.astype(x.dtype).reshape(b, h, w, 2, 2, f).transpose(0, 1, 3, 2, 4, 5)
         return y.reshape(b, 2 * h, 2 * w, f) + bias[None, None, None]
 
 
@@ -64,10 +69,11 @@ class _Block(nn.Module):
 
     features: int
     norm: str
+    precision: str
 
     @nn.compact
     def __call__(self, x: Array, train: bool) -> Array:
-        x = _Conv(self.features, name="conv")(x)
+        x = SameConv(self.features, self.precision, name="conv")(x)
         return _normalize_relu(self.norm, x, train)
 
 
@@ -110,6 +116,7 @@ class FeaturePyramid(nn.Module):
     widths: tuple[int, ...]
     layers: tuple[int, ...]
     norm: str
+    precision: str = "float32"
 
     @nn.compact
     def __call__(self, x: Float[Array, "b h w c"], train: bool) -> Float[Array, "b h w f"]:
@@ -123,13 +130,15 @@ class FeaturePyramid(nn.Module):
                 skips.append(x)
                 x = _halve(_halve(x, 1), 2)
             for i in range(n):
-                x = _Block(features, self.norm, name=f"encoder{level}_{i}")(x, train)
+                block = _Block(features, self.norm, self.precision, name=f"encoder{level}_{i}")
+                x = block(x, train)
         for level in reversed(range(len(skips))):
-            up = TransposedConv(self.widths[level], name=f"up{level}")(x)
+            up = TransposedConv(self.widths[level], self.precision, name=f"up{level}")(x)
             up = _UpNorm(self.norm, name=f"up_norm{level}")(up, train)
             joined = jnp.concatenate([up, skips[level]], axis=-1)
             mixed = self.widths[max(level - 1, 0)]
-            x = _Block(mixed, self.norm, name=f"decoder{level}")(joined, train)
+            block = _Block(mixed, self.norm, self.precision, name=f"decoder{level}")
+            x = block(joined, train)
         return x[:, :height, :width]
 
 

@@ -1,0 +1,96 @@
+"""`train_detector.py drive`: a moving picture of a drive on which a sensor dies."""
+
+from __future__ import annotations
+
+from typing import Any
+
+from snn_fusion_failure.commands.detector_options import Drive
+from snn_fusion_failure.commands.detector_runs import (
+    build,
+    cache_folder,
+    load_run,
+    run_config,
+    run_folder,
+)
+from snn_fusion_failure.runs import enable_compilation_cache, progress
+
+
+def severities(n: int) -> list[float]:
+    """Of the failure in each frame: 0 in the first third, rising in the second, 1 in the last.
+
+    Example:
+        >>> severities(7)
+        [0.0, 0.0, 0.0, 0.5, 1.0, 1.0, 1.0]
+    """
+    return [min(1.0, max(0.0, 3.0 * i / max(1, n - 1) - 1.0)) for i in range(n)]
+
+
+def drive(config: Drive) -> dict[str, Any]:
+    """Simulate the drive, detect in every frame, write the picture; returns means."""
+    enable_compilation_cache()
+    import numpy as np
+
+    from fusion.detection.animation import Moment, animate_drive
+    from fusion.detection.kitti.files import Frame
+    from fusion.detection.learning.cache import open_cache
+    from fusion.detection.learning.examples import MEAN_RGB, make_example
+    from fusion.detection.learning.fitting import failed_inputs, run_detector
+    from fusion.detection.learning.training import FAILURES
+    from fusion.detection.simulator.drive import drive_frames
+    from fusion.detection.simulator.labels import labels_of
+    from fusion.detection.simulator.rendering import SIZES, nominal_calibration
+    from fusion.detection.simulator.scene import SceneConfig
+
+    if config.failure not in FAILURES:
+        raise ValueError(f"failure={config.failure!r}: expected one of {', '.join(FAILURES)}")
+    run = config.run or run_folder(config)
+    trained = run_config(run, config)
+    setup = build(trained, open_cache(cache_folder(config)))
+    state = load_run(run, setup)
+    sensors = SIZES[config.size]
+    calibration = nominal_calibration(sensors.scale)
+    moments = []
+    with progress() as bar:
+        task = bar.add_task("drive", total=config.frames, status="")
+        made = drive_frames(
+            SceneConfig(night=0.0), sensors, config.frames, seed=config.scene, speed=config.speed
+        )
+        for simulated, severity in zip(made, severities(config.frames), strict=True):
+            read = simulated.readings
+            image = np.round(255 * np.asarray(read.image)).astype(np.uint8)
+            labels = labels_of(simulated.scene, simulated.seen, calibration, *image.shape[:2])
+            points = np.asarray(read.points)[np.asarray(read.mask)].astype(np.float32)
+            plane = np.asarray(simulated.scene.plane)
+            name = f"{simulated.index:06d}"
+            frame = Frame(name, image, points, calibration, labels, plane)
+            example, _ = make_example(setup.config, frame)
+            # The same noise in every frame: only the severity changes.
+            options = {"failure": config.failure, "severity": severity, "seed": config.seed}
+            inputs = failed_inputs(setup.config, example, **options)
+            (found,) = run_detector(setup.config, state, [example], **options)
+            sure = found.mask & (found.scores >= config.threshold)
+            moments.append(
+                Moment(
+                    image=np.clip(np.asarray(inputs.image[0]) + np.asarray(MEAN_RGB), 0, 1),
+                    map=np.asarray(inputs.bev[0, ..., -1]),
+                    labels=example.truth[example.truth_mask],
+                    found=found.boxes[sure],
+                    weights=found.weights,
+                    failed=found.failed,
+                    severity=severity,
+                )
+            )
+            bar.update(task, advance=1)
+    out = config.out or run / f"drive_{config.failure}.gif"
+    out.parent.mkdir(parents=True, exist_ok=True)
+    moving = animate_drive(moments, setup.config.bev, config.failure)
+    moving.save(out, writer="pillow", fps=config.fps, dpi=config.dpi)
+    sensor = "lidar" if config.failure.startswith("lidar") else "camera"
+    k = ("camera", "lidar").index(sensor)
+    return {
+        "picture": str(out),
+        "frames": len(moments),
+        f"weight_{sensor}_first": float(moments[0].weights[k]),
+        f"weight_{sensor}_last": float(moments[-1].weights[k]),
+        "detections": sum(len(m.found) for m in moments),
+    }

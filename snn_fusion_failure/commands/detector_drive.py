@@ -30,7 +30,7 @@ def drive(config: Drive) -> dict[str, Any]:
     enable_compilation_cache()
     import numpy as np
 
-    from fusion.detection.animation import Moment, animate_drive
+    from fusion.detection.drive_plots import Moment, animate_drive
     from fusion.detection.kitti.files import Frame
     from fusion.detection.learning.cache import open_cache
     from fusion.detection.learning.examples import MEAN_RGB, make_example

@@ -38,7 +38,7 @@ BY_PATH = {
     "fusion.spiking.exchange": "spiking encoders as NIR graphs",
     "fusion.lattice.plots": "pictures (matplotlib)",
     "fusion.detection.kitti": "files of KITTI and the official score",
-    "fusion.detection.learning.portable": "detectors as programs that need jax alone",
+    "fusion.detection.learning.stablehlo": "detectors as programs that need jax alone",
     "fusion.detection.plots": "pictures (matplotlib)",
     "failure.rev_argate": "Rev-ARGate (brings the fusion package along)",
     "failure.revnet": "invertible networks",

@@ -16,7 +16,7 @@ from PIL import Image
 
 from fusion.detection.learning.examples import make_example
 from fusion.detection.learning.fitting import run_detector
-from fusion.detection.learning.portable import resize_image, write_detector
+from fusion.detection.learning.stablehlo import resize_image, write_detector
 from fusion.detection.learning.training import DetectorState, init_training
 from fusion.detection.presets import preset
 from tests.fusion.test_detection_network import a_frame

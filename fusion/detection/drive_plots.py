@@ -47,7 +47,7 @@ def _outlines(axes: Axes, boxes: np.ndarray, colour: str) -> list[Any]:
     return [line for way in ground for line in axes.plot(*way.T, color=colour, lw=1.4)]
 
 
-def animate_drive(moments: Sequence[Moment], area: BevConfig, failure: str) -> FuncAnimation:
+def plot_drive(moments: Sequence[Moment], area: BevConfig, failure: str) -> FuncAnimation:
     """Camera picture, road from above with labels and detections, weights and probabilities.
 
     Args:

@@ -30,7 +30,7 @@ def drive(config: Drive) -> dict[str, Any]:
     enable_compilation_cache()
     import numpy as np
 
-    from fusion.detection.drive_plots import Moment, animate_drive
+    from fusion.detection.drive_plots import Moment, plot_drive
     from fusion.detection.kitti.files import Frame
     from fusion.detection.learning.cache import open_cache
     from fusion.detection.learning.examples import MEAN_RGB, make_example
@@ -83,7 +83,7 @@ def drive(config: Drive) -> dict[str, Any]:
             bar.update(task, advance=1)
     out = config.out or run / f"drive_{config.failure}.gif"
     out.parent.mkdir(parents=True, exist_ok=True)
-    moving = animate_drive(moments, setup.config.bev, config.failure)
+    moving = plot_drive(moments, setup.config.bev, config.failure)
     moving.save(out, writer="pillow", fps=config.fps, dpi=config.dpi)
     sensor = "lidar" if config.failure.startswith("lidar") else "camera"
     k = ("camera", "lidar").index(sensor)

@@ -94,7 +94,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
     if config.split != TESTING:
         widths = [float(camera.image_size[1]) for camera in cameras.values()]
         summary |= _score(config, target, names, objects, widths, out)
-    if (config.failure or "").startswith(SENSORS) and setup.config.weighs:
+    if config.failure and config.failure.startswith(SENSORS) and setup.config.weighs:
         path = _clean_weights(folder, config)
         if not path.exists():
             clean = run_detector(setup.config, state, examples(), seed=config.seed)

@@ -65,7 +65,7 @@ def detect_raw(
         p2: projection into the image.
         plane: ground plane a, b, c, d.
     """
-    size = image.shape[:2]
+    size = (image.shape[0], image.shape[1])
     mask = _seen(config, points, to_camera, p2, size)
     points = jnp.where(mask[:, None], points, 0.0)
     none = np.zeros((config.max_objects, 7), np.float32)

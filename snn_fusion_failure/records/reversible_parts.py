@@ -216,7 +216,8 @@ def restored_scores(
     from fusion.models import export, init, predict
 
     key, model = jax.random.key(seed), settings.model
-    main = export(fit(*settings, dataset, noise, key=key).state.params)
+    parts = settings.model, settings.train, settings.hyper
+    main = export(fit(*parts, dataset, noise, key=key).state.params)
     drawn = export(init(key, model))["encoder"]
     chosen = np.random.default_rng(seed).permutation(len(scored_on.test_y))[:TEST_ROWS]
     test, labels = jnp.asarray(scored_on.test_x[chosen]), scored_on.test_y[chosen]

@@ -52,8 +52,9 @@ def _auxiliary_logits(model: Any) -> Any:
 
     from fusion.models import auxiliary_logits, export, predict
 
-    def logits(params: Any, x: Any) -> Any:
-        return auxiliary_logits(model, params, x, predict(model, export(params), x).features)
+    def logits(params: Any, x: Any, failed: Any) -> Any:
+        features = predict(model, export(params), x, failed).features
+        return auxiliary_logits(model, params, x, features)
 
     return jax.jit(logits)
 
@@ -74,7 +75,8 @@ def auxiliary(model: Any, params: Any, x: Any, failed: Any, y: np.ndarray) -> di
     from fusion.losses import cross_entropy
 
     logits_of = _auxiliary_logits(model)
-    parts = [logits_of(params, x[i : i + 512]) for i in range(0, len(x), 512)]
+    places = [slice(i, i + 512) for i in range(0, len(x), 512)]
+    parts = [logits_of(params, x[place], failed[place]) for place in places]
     logits = np.concatenate([np.asarray(part) for part in parts])
     told = np.broadcast_to(y[:, None], logits.shape[:2])
     works = ~np.asarray(failed)
@@ -95,7 +97,8 @@ def trained_scores(
     from fusion.spiking.operations import cost
 
     key, model = jax.random.key(seed), settings.model
-    state = fit(*settings, dataset, noise, key=key).state
+    parts = settings.model, settings.train, settings.hyper
+    state = fit(*parts, dataset, noise, key=key).state
     record = scored(model, state, dataset, noise, noise.kind, key=key)
     if model.recipe.loss.auxiliary:
         x, failed = gate_scores.corrupted(

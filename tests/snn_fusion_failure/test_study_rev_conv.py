@@ -87,11 +87,11 @@ def test_columns_train_and_tell_their_scores(
     data = load("simulated")
     found = {
         model: study.execute(config, study.Run(study.TRAINED_FOR_UNSEEN, model, 0), data)
-        for model in ("rev_conv_argate_bayesian", "rev_conv_drawn_linear", "rev_conv_oracle")
+        for model in ("rev_conv_oracle", "rev_conv_argate_bayesian")
     }
     assert {"accuracy", "failed_auroc", "ece"} <= set(found["rev_conv_argate_bayesian"]["unseen"])
     assert found["rev_conv_oracle"]["failed_auroc"] == 1.0
-    assert "aux_loss" not in found["rev_conv_drawn_linear"]
+    assert 0.0 < found["rev_conv_oracle"]["aux_loss"] < 3.0
     assert min(record["accuracy"] for record in found.values()) > 30.0  # four classes
     assert all(record["training_memory"] > 0.1 for record in found.values())
 

@@ -264,7 +264,7 @@ def _assemble(
     ]
     sensors = tuple(schema["sensors"])
     return SensorFolder(
-        sensors, channels, kind, names, *parts, tuple(scales), centre, spread, weights
+        sensors, channels, kind, names, parts[0], parts[1], tuple(scales), centre, spread, weights
     )
 
 

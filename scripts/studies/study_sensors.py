@@ -186,7 +186,7 @@ def load_data(config: Config) -> Any:
     from fusion.data import load, validation_split
 
     _, (case, *_) = STUDIES[config.study]
-    given = {name: case.options.get(name) for name in ("split", "features")}
+    given: dict[str, Any] = {name: case.options.get(name) for name in ("split", "features")}
     dataset = load(case.options["dataset"], config.data_dir, **given)
     held_out = config.validation or case.options.get("validation")
     return validation_split(dataset, seed=config.split_seed) if held_out else dataset

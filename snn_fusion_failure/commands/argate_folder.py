@@ -64,7 +64,9 @@ def train_folder(config: Config) -> dict[str, Any]:
     data = load_folder(config.data or "", seed=config.seed, validation=config.validation)
     k = len(data.sensors)
     epochs = config.epochs or (10 if config.preset == "quick" else 30)
-    given = {"learning_rate": config.learning_rate} if config.learning_rate is not None else {}
+    given: dict[str, Any] = (
+        {"learning_rate": config.learning_rate} if config.learning_rate is not None else {}
+    )
     settings = sensor_network.FolderConfig(config.model, epochs=epochs, **given)
     if config.protocol == "clean":
         protocol = failures.no_failure(data.sensors)

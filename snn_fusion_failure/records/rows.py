@@ -47,8 +47,8 @@ def compare_columns(
                 continue
             test = paired_test(*([t[s][metric] for s in common] for t in (a, b)))
             found.append({"row": row, "comparison": f"{one} - {other}", **test._asdict()})
-    for test, p in zip(found, holm([test["p_value"] for test in found]), strict=True):
-        test["p_holm"] = p
+    for pair, p in zip(found, holm([pair["p_value"] for pair in found]), strict=True):
+        pair["p_holm"] = p
     return found
 
 

@@ -196,7 +196,7 @@ def declared_agent(
         rates = jnp.asarray(encode(reading))
         none = jnp.zeros((2,), state.turn.dtype)
 
-        def one_window(carry: tuple, index: Array) -> tuple:
+        def one_window(carry: tuple, index: Array) -> tuple[tuple, Array]:
             network, rewards = carry
             spikes = poisson_spikes(rates, window, dt=wiring.dt, key=jax.random.fold_in(key, index))
             given = rewards_of(rewards)
@@ -215,7 +215,10 @@ def declared_agent(
             return (network, rewards), count
 
         n_windows = control_steps // window
-        (network, _), counts = jax.lax.scan(one_window, (begin, none), jnp.arange(n_windows))
+        carry: tuple
+        counts: Array
+        carry, counts = jax.lax.scan(one_window, (begin, none), jnp.arange(n_windows))
+        network = carry[0]
         kept = with_weights_of(network, state.network)
         learns = active & jnp.asarray(plastic)
         network = jax.tree.map(lambda a, b: jnp.where(learns, a, b), network, kept)

@@ -45,7 +45,7 @@ from snn_fusion_failure.runs import print_result, repository, run_command
 MODELS: tuple[choices.Model, ...] = (
     "dense", "dense_argate", "dense_oracle", "avod", "avod_argate",
 )  # fmt: skip
-BASELINE = "dense"
+BASELINE: choices.Model = "dense"
 SINGLE = {"camera_only": (1.0, 0.0), "lidar_only": (0.0, 1.0)}
 """Detectors of one sensor, made from the trained baseline by fixed fusion weights."""
 FOLDS = (
@@ -203,7 +203,7 @@ def _means(found: dict[Cell, dict[str, float]], base: Any, kinds: Any) -> dict[s
     def by_kind(scores: dict[Cell, dict[str, float]]) -> dict[str, dict[str, float]]:
         out: dict[str, dict[str, float]] = {}
         for cell, values in scores.items():
-            if cell.failure in kinds:
+            if cell.failure is not None and cell.failure in kinds:
                 out.setdefault(cell.failure, {})[str(cell.level)] = values[METRIC]
         return out
 

@@ -65,7 +65,11 @@ def drive(config: Drive) -> dict[str, Any]:
             frame = Frame(name, image, points, calibration, labels, plane)
             example, _ = make_example(setup.config, frame)
             # The same noise in every frame: only the severity changes.
-            options = {"failure": config.failure, "severity": severity, "seed": config.seed}
+            options: dict[str, Any] = {
+                "failure": config.failure,
+                "severity": severity,
+                "seed": config.seed,
+            }
             inputs = failed_inputs(setup.config, example, **options)
             (found,) = run_detector(setup.config, state, [example], **options)
             sure = found.mask & (found.scores >= config.threshold)
@@ -73,10 +77,10 @@ def drive(config: Drive) -> dict[str, Any]:
                 Moment(
                     image=np.clip(np.asarray(inputs.image[0]) + np.asarray(MEAN_RGB), 0, 1),
                     map=np.asarray(inputs.bev[0, ..., -1]),
-                    labels=example.truth[example.truth_mask],
-                    found=found.boxes[sure],
-                    weights=found.weights,
-                    failed=found.failed,
+                    labels=np.asarray(example.truth)[np.asarray(example.truth_mask)],
+                    found=np.asarray(found.boxes)[np.asarray(sure)],
+                    weights=np.asarray(found.weights),
+                    failed=np.asarray(found.failed),
                     severity=severity,
                 )
             )

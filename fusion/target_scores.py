@@ -41,8 +41,8 @@ def macro_f1(output: np.ndarray, target: np.ndarray) -> float:
     A label that occurs neither in the rows nor in the predictions counts as 1.
 
     Example:
-        >>> macro_f1(np.array([[1.0], [1.0], [-1.0]]), np.array([[1.0], [0.0], [0.0]]))
-        66.66666666666667
+        >>> round(macro_f1(np.array([[1.0], [1.0], [-1.0]]), np.array([[1.0], [0.0], [0.0]])), 2)
+        66.67
     """
     said, true = output > 0.0, target > 0.5
     hits, wrong = (said & true).sum(axis=0), (said ^ true).sum(axis=0)

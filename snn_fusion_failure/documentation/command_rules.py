@@ -90,6 +90,11 @@ RULES = (
         f"{_ROBOT} --test-trials 1 --only tuned",
         forget="results/study_snn_way.json",
     ),
+    Rule(
+        "study_snn.py way_gamma",
+        f"{_ROBOT} --test-trials 1 --only 'way, gamma 0.0003'",
+        forget="results/study_snn_way_gamma.json",
+    ),
     Rule("figures_snn.py", "--scenarios 1"),
     Rule("compare_snn.py"),
     Rule(

@@ -23,7 +23,8 @@ def bound(metric: str, unit: str | None) -> float | None:
         >>> bound("sr_testing", "%"), bound("success_rate", "1"), bound("n_mv", "steps")
         (100.0, 1.0, None)
     """
-    if not SHARES.match(metric):
+    # Differences of shares go below 0.
+    if not SHARES.match(metric) or "_above_" in metric:
         return None
     # Rows without a unit are success rates in percent.
     return 1.0 if unit == "1" else 100.0

@@ -271,7 +271,8 @@ def test_vmap_over_maps_equals_a_loop() -> None:
     for i, params in enumerate(three):
         state = reset(params, key=keys[i])
         reading, after = observe(params, state), step(params, state, 5.0)[0]
-        for a, b in zip(together[0], reading, strict=True):
+        pair = (jax.tree.leaves(readings) for readings in (together[0], reading))
+        for a, b in zip(*pair, strict=True):
             np.testing.assert_allclose(a[i], b, rtol=1e-5, atol=1e-3)
         np.testing.assert_allclose(together[1].x[i], after.x, rtol=1e-6)
 

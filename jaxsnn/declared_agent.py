@@ -44,13 +44,6 @@ class DriveParams(NamedTuple):
     arrival: float | Array = 2.0
 
 
-class DriveState(NamedTuple):
-    """The network, and the turn that its motors asked for last [deg]."""
-
-    network: declared.State
-    turn: Float[Array, ""]
-
-
 def motor_credit(
     wiring: declared.Wiring, *, motors: str = "motors"
 ) -> dict[str, Float[np.ndarray, "n_pre n_post 2"]]:
@@ -130,7 +123,7 @@ def declared_agent(
         plastic: False to hold the weights.
 
     Returns:
-        Agent whose parameters are DriveParams and whose state is DriveState.
+        Agent whose parameters are DriveParams and whose state is that of the network.
 
     Raises:
         ValueError: names that nothing has, a reward that is missing, windows that do not fit.
@@ -172,9 +165,8 @@ def declared_agent(
         }
         return state._replace(synapses=held)
 
-    def init(key: Key[Array, ""], params: DriveParams) -> DriveState:
-        network = declared.init(key, wiring)
-        return DriveState(network, jnp.zeros((), _voltage(network).dtype))
+    def init(key: Key[Array, ""], params: DriveParams) -> declared.State:
+        return declared.init(key, wiring)
 
     def at_rest(state: declared.State) -> declared.State:
         rest = declared.init(jax.random.key(0), wiring)
@@ -183,18 +175,16 @@ def declared_agent(
 
     def act(
         params: DriveParams,
-        state: DriveState,
+        state: declared.State,
         reading: Reading,
         fresh: Bool[Array, ""],
         active: Bool[Array, ""],
         *,
         key: Key[Array, ""],
-    ) -> tuple[DriveState, Float[Array, ""], Reading, Float[Array, "2"]]:
-        begin = jax.tree.map(
-            lambda a, b: jnp.where(fresh, a, b), at_rest(state.network), state.network
-        )
+    ) -> tuple[declared.State, Float[Array, ""], Reading, Float[Array, "2"]]:
+        begin = jax.tree.map(lambda a, b: jnp.where(fresh, a, b), at_rest(state), state)
         rates = jnp.asarray(encode(reading))
-        none = jnp.zeros((2,), state.turn.dtype)
+        none = jnp.zeros((2,), _dtype(state))
 
         def one_window(carry: tuple, index: Array) -> tuple[tuple, Array]:
             network, rewards = carry
@@ -219,44 +209,38 @@ def declared_agent(
         counts: Array
         carry, counts = jax.lax.scan(one_window, (begin, none), jnp.arange(n_windows))
         network = carry[0]
-        kept = with_weights_of(network, state.network)
+        kept = with_weights_of(network, state)
         learns = active & jnp.asarray(plastic)
         network = jax.tree.map(lambda a, b: jnp.where(learns, a, b), network, kept)
         firing = counts.sum(axis=0) / (control_steps * wiring.dt)
         turn = jnp.clip(_turn(params, firing), -params.max_turn, params.max_turn)
-        turn = turn.astype(state.turn.dtype)
-        return DriveState(network, turn), turn, reading, firing
+        return network, turn.astype(none.dtype), reading, firing
 
     def learn(
         params: DriveParams,
-        state: DriveState,
+        state: declared.State,
         memory: Reading,
         outcome: Outcome,
         next_reading: Reading | None,
         active: Bool[Array, ""],
-    ) -> DriveState:
+    ) -> declared.State:
         if not plastic or not rewarded:
             return state
         end = jnp.where(
             outcome.collided, params.collision, jnp.where(outcome.arrived, params.arrival, 0.0)
         )
-        silence = jnp.zeros(wiring.populations[sensors].n, state.turn.dtype)
-        both = jnp.broadcast_to(window * end, (2,)).astype(state.turn.dtype)
+        silence = jnp.zeros(wiring.populations[sensors].n, _dtype(state))
+        both = jnp.broadcast_to(window * end, (2,)).astype(silence.dtype)
         after, _ = declared.step(
-            wiring, params.network, state.network, {sensors: silence, **rewards_of(both)}
+            wiring, params.network, state, {sensors: silence, **rewards_of(both)}
         )
         ended = active & (outcome.collided | outcome.arrived)
-        network = jax.tree.map(
-            lambda a, b: jnp.where(ended, a, b),
-            with_weights_of(state.network, after),
-            state.network,
+        return jax.tree.map(
+            lambda a, b: jnp.where(ended, a, b), with_weights_of(state, after), state
         )
-        return state._replace(network=network)
 
-    def finite(state: DriveState) -> Bool[Array, ""]:
-        return jnp.all(
-            jnp.stack([jnp.all(jnp.isfinite(m.v)) for m in state.network.membranes.values()])
-        )
+    def finite(state: declared.State) -> Bool[Array, ""]:
+        return jnp.all(jnp.stack([jnp.all(jnp.isfinite(m.v)) for m in state.membranes.values()]))
 
     return Agent(
         init=init,
@@ -271,5 +255,5 @@ def _turn(params: DriveParams, rates: Float[Array, "2"]) -> Float[Array, ""]:
     return params.steering_gain * (rates[1] - rates[0])
 
 
-def _voltage(state: declared.State) -> Array:
-    return next(iter(state.membranes.values())).v
+def _dtype(state: declared.State) -> jnp.dtype:
+    return next(iter(state.membranes.values())).v.dtype

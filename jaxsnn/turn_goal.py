@@ -127,9 +127,7 @@ def turn_reward(
 
     Source: ours; the delta rule of Widrow and Hoff (1960).
     """
-    goal, weight = turn_goal(params, reading, recent_turn)
-    error = weight * jnp.clip((goal - turn) / params.scale, -1.0, 1.0)
-    return jnp.stack([-error, error])
+    return _error_reward(params, *turn_goal(params, reading, recent_turn), turn)
 
 
 def way_reward(
@@ -159,5 +157,12 @@ def way_reward(
             "ways.with_way(map)"
         )
     goal = jnp.clip(reading.way_turn, -params.towards, params.towards)
-    error = params.target_weight * jnp.clip((goal - turn) / params.scale, -1.0, 1.0)
+    return _error_reward(params, goal, params.target_weight, turn)
+
+
+def _error_reward(
+    params: TurnGoalParams, goal: Array, weight: float | Array, turn: Array
+) -> Float[Array, "2"]:
+    """What is left of the turn to its goal, for the right motor and against the left one."""
+    error = weight * jnp.clip((goal - turn) / params.scale, -1.0, 1.0)
     return jnp.stack([-error, error])

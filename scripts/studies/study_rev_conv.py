@@ -24,7 +24,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from snn_fusion_failure.records.rows import compare_columns, record_table, summarize
+from snn_fusion_failure.records.rows import column_cells, compare_columns, record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -225,15 +225,12 @@ def load_runs(config: Config) -> dict[tuple[str, str], dict[int, dict[str, Any]]
 
 def _cells(config: Config) -> list[dict[str, Any]]:
     """Rows in the schema of record."""
-    rows = []
-    for (row, model), by_seed in load_runs(config).items():
-        for metric, unit in (RESTORED if row.endswith("restored") else METRICS).items():
-            values: list[Any] = [record.get(metric) for record in by_seed.values()]
-            # Auxiliary paths, gates and intervals are scored where there are any.
-            if any(v is None or v != v for v in values):
-                continue
-            cell = {"row": row, "model": model, "metric": metric, "unit": unit}
-            rows.append(cell | summarize(values))
+    # Auxiliary paths, gates and intervals are scored where there are any.
+    rows = [
+        {"row": row, "model": model} | cell
+        for (row, model), by_seed in load_runs(config).items()
+        for cell in column_cells(by_seed, RESTORED if row.endswith("restored") else METRICS)
+    ]
     (memory,) = runs(dataclasses.replace(config, part="memory"))
     if (path := memory.path(config)).exists():
         for cell in json.loads(path.read_text(encoding="utf-8"))["cells"]:

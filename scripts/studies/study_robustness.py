@@ -275,14 +275,14 @@ def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
                 unit = "%" if metric == METRIC else "1"
                 cell = {"row": row, "model": model, "metric": metric, "unit": unit}
                 rows.append(cell | {"split": config.split} | summarize(values))
-        base = held.get((row, "avod" if model == "avod_argate" else BASELINE), {})
+        other = "avod" if model == "avod_argate" else BASELINE
+        base = held.get((row, other), {})
         shared = sorted(base.keys() & by_seed.keys())
         if (
             row.startswith(("clean", "seen", "unseen", "misaligned"))
             and model != BASELINE
             and len(shared) > 1
         ):
-            other = "avod" if model == "avod_argate" else BASELINE
             a, b = ([scores[s][METRIC] for s in shared] for scores in (by_seed, base))
             comparison = {"row": row, "comparison": f"{model} - {other}", "metric": METRIC}
             pairs.append(comparison | paired_test(a, b)._asdict())

@@ -31,7 +31,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import compare_columns, record_table, summarize
+from snn_fusion_failure.records.rows import column_cells, compare_columns, record_table, summarize
 from snn_fusion_failure.records.sensor_cases import PAIRS, STUDIES, Case
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
@@ -159,15 +159,13 @@ def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
 
     held = load_runs(config)
     pairs = compare_columns(held, PAIRS)
+    units = {metric: "1" if metric.startswith("gate") else "%" for metric in METRICS}
     rows: list[dict[str, Any]] = []
     for (name, model), by_seed in held.items():
         cell = {"row": name, "model": model}
         cell |= {"git": ", ".join(sorted({str(r["git"]) for r in by_seed.values()}))}
-        for metric in METRICS:
-            values: list[Any] = [r.get(metric) for r in by_seed.values()]
-            if not any(v is None or v != v for v in values):  # no sensor fails, or no gate
-                unit = "1" if metric.startswith("gate") else "%"
-                rows.append(cell | {"metric": metric, "unit": unit} | summarize(values))
+        # A gate is not scored where no sensor fails, nor where there is none.
+        rows += [cell | scores for scores in column_cells(by_seed, units)]
         equal = held.get((name, "equal_weights"), {})
         common = sorted(set(equal) & set(by_seed))
         if common and (model, "equal_weights") in PAIRS:

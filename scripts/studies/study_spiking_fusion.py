@@ -20,7 +20,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import compare_columns, record_table, summarize
+from snn_fusion_failure.records.rows import column_cells, compare_columns, record_table
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -214,15 +214,12 @@ def load_runs(config: Config) -> dict[tuple[str, str], dict[int, dict[str, Any]]
 def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
     """Rows in the schema of record, and paired comparisons of accuracy (Holm over all of them)."""
     held = load_runs(config)
-    rows = []
-    for (row, model), by_seed in held.items():
-        for metric, unit in METRICS.items():
-            values: list[Any] = [record.get(metric) for record in by_seed.values()]
-            # A gate is not scored where no sensor fails, nor where there is none.
-            if any(v is None or v != v for v in values):
-                continue
-            cell = {"row": row, "model": model, "metric": metric, "unit": unit}
-            rows.append(cell | summarize(values))
+    # A gate is not scored where no sensor fails, nor where there is none.
+    rows = [
+        {"row": row, "model": model} | cell
+        for (row, model), by_seed in held.items()
+        for cell in column_cells(by_seed, METRICS)
+    ]
     return rows, compare_columns(held, PAIRS)
 
 

@@ -31,13 +31,12 @@ def drive(config: Drive) -> dict[str, Any]:
     import numpy as np
 
     from fusion.detection.drive_plots import Moment, plot_drive
-    from fusion.detection.kitti.files import Frame
     from fusion.detection.learning.cache import open_cache
     from fusion.detection.learning.examples import MEAN_RGB, make_example
     from fusion.detection.learning.fitting import failed_inputs, run_detector
     from fusion.detection.learning.training import FAILURES
     from fusion.detection.simulator.drive import drive_frames
-    from fusion.detection.simulator.labels import labels_of
+    from fusion.detection.simulator.frames import kitti_frame
     from fusion.detection.simulator.rendering import SIZES, nominal_calibration
     from fusion.detection.simulator.scene import SceneConfig
 
@@ -56,14 +55,7 @@ def drive(config: Drive) -> dict[str, Any]:
             SceneConfig(night=0.0), sensors, config.frames, seed=config.scene, speed=config.speed
         )
         for simulated, severity in zip(made, severities(config.frames), strict=True):
-            read = simulated.readings
-            image = np.round(255 * np.asarray(read.image)).astype(np.uint8)
-            labels = labels_of(simulated.scene, simulated.seen, calibration, *image.shape[:2])
-            points = np.asarray(read.points)[np.asarray(read.mask)].astype(np.float32)
-            plane = np.asarray(simulated.scene.plane)
-            name = f"{simulated.index:06d}"
-            frame = Frame(name, image, points, calibration, labels, plane)
-            example, _ = make_example(setup.config, frame)
+            example, _ = make_example(setup.config, kitti_frame(simulated, calibration))
             # The same noise in every frame: only the severity changes.
             options: dict[str, Any] = {
                 "failure": config.failure,

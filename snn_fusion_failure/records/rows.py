@@ -24,6 +24,23 @@ def summarize(values: Sequence[float]) -> dict[str, Any]:
     return {"n": len(values), "mean": found.mean, "ci95": [found.low, found.high], "values": values}
 
 
+def column_cells(
+    by_seed: Mapping[int, Mapping[str, Any]], metrics: Mapping[str, str]
+) -> list[dict[str, Any]]:
+    """Metric, unit and summary of every metric that all seeds of a column have.
+
+    Args:
+        by_seed: seed -> scores; a score that was not taken is missing, None or NaN.
+        metrics: metric -> unit.
+    """
+    cells = []
+    for metric, unit in metrics.items():
+        values: list[Any] = [scores.get(metric) for scores in by_seed.values()]
+        if not any(v is None or v != v for v in values):
+            cells.append({"metric": metric, "unit": unit} | summarize(values))
+    return cells
+
+
 def compare_columns(
     held: Mapping[tuple[str, str], Mapping[int, Mapping[str, Any]]],
     pairs: Iterable[tuple[str, str]],

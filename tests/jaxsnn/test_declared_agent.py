@@ -100,7 +100,7 @@ def test_a_control_step_is_run_of_the_network_window_by_window():
         state
     )
 
-    by_hand, both, counts = state.network, jnp.zeros(2), []
+    by_hand, both, counts = state, jnp.zeros(2), []
     for number in range(2):
         spikes = poisson_spikes(encode(reading), 25, dt=net.dt, key=jax.random.fold_in(key, number))
         given = {n: jnp.asarray(c, jnp.float32) @ both for n, c in motor_credit(net).items()}
@@ -112,9 +112,9 @@ def test_a_control_step_is_run_of_the_network_window_by_window():
     np.testing.assert_allclose(firing, np.sum(counts, axis=0) / 0.05, rtol=1e-6)
     np.testing.assert_allclose(turn, firing[1] - firing[0], rtol=1e-6)
     for name in ("first", "second"):
-        mine, theirs = new.network.synapses[name].weights, by_hand.synapses[name].weights
+        mine, theirs = new.synapses[name].weights, by_hand.synapses[name].weights
         np.testing.assert_allclose(mine, theirs, rtol=1e-5, atol=1e-6)
-        assert float(jnp.abs(mine - state.network.synapses[name].weights).max()) > 0
+        assert float(jnp.abs(mine - state.synapses[name].weights).max()) > 0
 
 
 def test_weights_are_held_while_the_robot_waits_and_when_frozen():
@@ -133,12 +133,12 @@ def test_weights_are_held_while_the_robot_waits_and_when_frozen():
         last = driver.learn(params, seen, memory, ended, None, active)
         for before, after in ((state, seen), (seen, last)):
             changed = np.abs(
-                before.network.synapses["first"].weights - after.network.synapses["first"].weights
+                before.synapses["first"].weights - after.synapses["first"].weights
             ).max()
             assert (changed > 0) == moves
         assert bool(driver.finite(last))
         fresh, *_ = driver.act(params, last, reading, yes, active, key=jax.random.key(0))
-        held = jnp.any(fresh.network.membranes["hidden"].v != last.network.membranes["hidden"].v)
+        held = jnp.any(fresh.membranes["hidden"].v != last.membranes["hidden"].v)
         assert bool(held) == moves  # the same start, but for what the weights have learnt
 
 

@@ -150,6 +150,11 @@ def angle_vector(rotation: Float[Array, "n"]) -> Float[Array, "n 2"]:
     return jnp.stack([jnp.cos(rotation), jnp.sin(rotation)], axis=1)
 
 
+def wrap_angle(angle: Float[Array, "*n"]) -> Float[Array, "*n"]:
+    """The same direction in [-pi, pi) [rad]."""
+    return jnp.mod(angle + jnp.pi, 2 * jnp.pi) - jnp.pi
+
+
 def resolve_heading(rotation: Float[Array, "n"], vector: Float[Array, "n 2"]) -> Float[Array, "n"]:
     """The heading `rotation` or its opposite, whichever the angle vector (of any length) prefers.
 
@@ -158,7 +163,7 @@ def resolve_heading(rotation: Float[Array, "n"], vector: Float[Array, "n 2"]) ->
     """
     agrees = (angle_vector(rotation) * vector).sum(axis=1) >= 0
     turned = jnp.where(agrees, rotation, rotation + jnp.pi)
-    return jnp.mod(turned + jnp.pi, 2 * jnp.pi) - jnp.pi
+    return wrap_angle(turned)
 
 
 def project_boxes(

@@ -11,6 +11,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from fusion.detection.geometry.bev import BevConfig
+from fusion.detection.geometry.encodings import wrap_angle
 
 
 def flip(
@@ -29,7 +30,7 @@ def flip(
     mirror = jnp.array([-1.0, 1.0, 1.0])
     rows = jnp.stack([(width - 1.0) * p2[2] - p2[0], p2[1], p2[2]])
     new_p2 = rows * jnp.array([[-1.0, 1.0, 1.0, 1.0]])
-    yaw = jnp.mod(jnp.pi - truth[:, 6] + jnp.pi, 2 * jnp.pi) - jnp.pi
+    yaw = wrap_angle(jnp.pi - truth[:, 6])
     boxes = truth.at[:, 0].multiply(-1.0).at[:, 6].set(yaw)
     return (
         image[:, ::-1],
@@ -69,7 +70,7 @@ def turn_and_scale(
     c, s, zero, one = jnp.cos(angle), jnp.sin(angle), jnp.zeros(()), jnp.ones(())
     rotation = jnp.stack([c, zero, s, zero, one, zero, -s, zero, c]).reshape(3, 3)
     whole = jnp.concatenate([p2[:, :3] @ rotation.T / factor, p2[:, 3:]], axis=1)
-    yaw = jnp.mod(truth[:, 6:] + angle + jnp.pi, 2 * jnp.pi) - jnp.pi
+    yaw = wrap_angle(truth[:, 6:] + angle)
     boxes = [factor * truth[:, :3] @ rotation.T, factor * truth[:, 3:6], yaw]
     return (
         factor * points @ rotation.T,

@@ -17,6 +17,7 @@ import numpy as np
 
 from fusion.detection.kitti.calibration import Calibration
 from fusion.detection.kitti.files import (
+    Frame,
     write_calibration,
     write_image,
     write_labels,
@@ -140,20 +141,29 @@ def simulate_frames(
             yield SimulatedFrame(index, scene, readings, seen, bool(scene.light[1] < 0.5))
 
 
+def kitti_frame(frame: SimulatedFrame, calibration: Calibration) -> Frame:
+    """The frame as it is read from KITTI's files: 8-bit image, points of the scan, labels."""
+    readings = frame.readings
+    image = np.round(255 * np.asarray(readings.image)).astype(np.uint8)
+    points = np.asarray(readings.points)[np.asarray(readings.mask)].astype(np.float32)
+    labels = labels_of(frame.scene, frame.seen, calibration, *image.shape[:2])
+    plane = np.asarray(frame.scene.plane)
+    return Frame(f"{frame.index:06d}", image, points, calibration, labels, plane)
+
+
 def write_frame(folder: Path, frame: SimulatedFrame, calibration: Calibration) -> dict[str, int]:
     """Write the files of one frame below `folder` (`OUT/training`), the labels last.
 
     Returns:
         Counts of points, labelled objects, cars and look-alikes.
     """
-    name = f"{frame.index:06d}"
-    readings, seen, scene = frame.readings, frame.seen, frame.scene
-    image = np.round(255 * np.asarray(readings.image)).astype(np.uint8)
-    points = np.asarray(readings.points)[np.asarray(readings.mask)]
+    seen, scene = frame.seen, frame.scene
+    name, image, points, _, labels, plane = kitti_frame(frame, calibration)
+    assert labels is not None and plane is not None  # a simulated frame has both
     write_image(folder / "image_2" / f"{name}.png", image)
     write_points(folder / "velodyne" / f"{name}.bin", points)
     write_calibration(folder / "calib" / f"{name}.txt", calibration)
-    write_plane(folder / "planes" / f"{name}.txt", np.asarray(frame.scene.plane))
+    write_plane(folder / "planes" / f"{name}.txt", plane)
     table = folder / "visibility" / f"{name}.csv"
     table.parent.mkdir(parents=True, exist_ok=True)
     with table.open("w", encoding="ascii", newline="") as file:
@@ -168,7 +178,6 @@ def write_frame(folder: Path, frame: SimulatedFrame, calibration: Calibration) -
                  f"{seen.share[i]:.3f}", int(seen.dark_paint[i]), int(seen.low_contrast[i]),
                  int(frame.night), *(f"{value:.4f}" for value in box)]
             )  # fmt: skip
-    labels = labels_of(frame.scene, seen, calibration, *image.shape[:2])
     write_labels(folder / "label_2" / f"{name}.txt", labels)
     return {
         "points": len(points),

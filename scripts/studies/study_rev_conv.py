@@ -24,7 +24,7 @@ import json
 from pathlib import Path
 from typing import Any, Literal, NamedTuple
 
-from snn_fusion_failure.records.rows import column_cells, compare_columns, record_table, summarize
+from snn_fusion_failure.records.rows import Compared, column_cells, record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -106,8 +106,13 @@ PAIRS = (
     ("spiking_argate_bayesian", "spiking_argate"),
 )
 """Columns that are compared seed by seed, in accuracy."""
-HYPOTHESIS = {"aux_loss": 1.0, "aux_accuracy": 1.0, "failed_auroc": 100.0}
-"""What else is compared of the first two pairs, and the factor that makes points of it."""
+COMPARED = (
+    Compared("accuracy", PAIRS),
+    Compared("aux_loss", PAIRS[:2]),
+    Compared("aux_accuracy", PAIRS[:2]),
+    Compared("failed_auroc", PAIRS[:2], 100.0),
+)
+"""Of the first two pairs the source's hypothesis too: better auxiliary paths, better weights."""
 METRICS = {
     **dict.fromkeys(("accuracy", "accuracy_clean", "accuracy_corrupted", "aux_accuracy"), "%"),
     **dict.fromkeys(("ece", "nll", "aurc", "failed_auroc", "aux_loss"), "1"),
@@ -239,26 +244,12 @@ def _cells(config: Config) -> list[dict[str, Any]]:
     return rows
 
 
-def compared(config: Config) -> list[dict[str, Any]]:
-    """Paired differences in points, Holm over all of them."""
-    cases: dict[tuple[str, str], dict[int, dict[str, Any]]] = {}
-    linked = {model for pair in PAIRS[:2] for model in pair}
-    for metric, factor in {"accuracy": 1.0, **HYPOTHESIS}.items():
-        for (row, model), by_seed in load_runs(config).items():
-            if row.endswith("restored") or (metric in HYPOTHESIS and model not in linked):
-                continue
-            case = row if metric == "accuracy" else f"{row}, {metric.replace('_', ' ')}"
-            points = {s: {"points": factor * r[metric]} for s, r in by_seed.items() if metric in r}
-            cases[case, model] = points
-    return compare_columns(cases, PAIRS, "points")
-
-
 def write(config: Config) -> list[dict[str, Any]]:
     """Put the table and its comparisons where they belong; returns its rows."""
     rows = _cells(config)
     if rows and not config.validation:
-        path, pairs = config.results / f"{NAME}.json", compared(config)
-        record_table(path, NAME, TITLE, rows, preset=config.preset, comparisons=pairs)
+        path = config.results / f"{NAME}.json"
+        record_table(path, NAME, TITLE, rows, preset=config.preset, compared=COMPARED)
     return rows
 
 

@@ -19,8 +19,8 @@ Nothing is chosen here: a run trains the preset for all of its epochs and is sco
 test rows, or with `--validation` on training rows that `--split-seed` draws and no training sees.
 Whole seeds come first; each training is kept in `runs/study_sensors` with the commit that made it
 and its CPU time, so the same command goes on after an interruption, and `results/study_NAME.json`
-is written after each. `above_equal_weights` is a difference seed by seed, with the p value of a
-paired t test, and Holm's over all comparisons of the study.
+is written after each. `above_equal_weights` is a difference seed by seed; paired t tests and
+Holm's correction over all comparisons of the table stand beside its rows.
 """
 
 from __future__ import annotations
@@ -31,7 +31,7 @@ import time
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import column_cells, compare_columns, record_table, summarize
+from snn_fusion_failure.records.rows import Compared, column_cells, record_table, summarize
 from snn_fusion_failure.records.sensor_cases import PAIRS, STUDIES, Case
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
@@ -153,16 +153,15 @@ def load_runs(config: Config) -> dict[tuple[str, str], dict[int, dict[str, Any]]
     return held
 
 
-def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows in the schema of record, and the comparisons of columns."""
+def collect(config: Config) -> list[dict[str, Any]]:
+    """Rows in the schema of record."""
     from snn_fusion_failure.records.fusion_tables import METRICS
 
     held = load_runs(config)
-    pairs = compare_columns(held, PAIRS)
     units = {metric: "1" if metric.startswith("gate") else "%" for metric in METRICS}
     rows: list[dict[str, Any]] = []
     for (name, model), by_seed in held.items():
-        cell = {"row": name, "model": model}
+        cell: dict[str, Any] = {"row": name, "model": model}
         cell |= {"git": ", ".join(sorted({str(r["git"]) for r in by_seed.values()}))}
         # A gate is not scored where no sensor fails, nor where there is none.
         rows += [cell | scores for scores in column_cells(by_seed, units)]
@@ -170,13 +169,9 @@ def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]
         common = sorted(set(equal) & set(by_seed))
         if common and (model, "equal_weights") in PAIRS:
             gains = [by_seed[s]["accuracy"] - equal[s]["accuracy"] for s in common]
-            cell |= {"metric": "above_equal_weights", "unit": "%"}
-            this = (name, f"{model} - equal_weights")
-            for pair in pairs:
-                if (pair["row"], pair["comparison"]) == this:
-                    cell |= {key: pair[key] for key in ("p_value", "p_holm")}
+            cell |= {"metric": "above_equal_weights", "unit": "%", "seeds": common}
             rows.append(cell | summarize(gains))
-    return rows, pairs
+    return rows
 
 
 def load_data(config: Config) -> Any:
@@ -192,7 +187,7 @@ def load_data(config: Config) -> Any:
 
 def write(config: Config) -> list[dict[str, Any]]:
     """Put the table where it belongs; returns its rows."""
-    rows, pairs = collect(config)
+    rows = collect(config)
     if rows:
         title, _ = STUDIES[config.study]
         if config.validation:
@@ -203,7 +198,7 @@ def write(config: Config) -> list[dict[str, Any]]:
             title,
             rows,
             preset=config.preset,
-            comparisons=pairs,
+            compared=[Compared("accuracy", PAIRS)],
         )
     return rows
 

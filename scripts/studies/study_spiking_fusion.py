@@ -20,7 +20,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import column_cells, compare_columns, record_table
+from snn_fusion_failure.records.rows import Compared, column_cells, record_table
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -211,21 +211,14 @@ def load_runs(config: Config) -> dict[tuple[str, str], dict[int, dict[str, Any]]
     return held
 
 
-def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows in the schema of record, and paired comparisons of accuracy (Holm over all of them)."""
-    held = load_runs(config)
+def write(config: Config) -> list[dict[str, Any]]:
+    """Put the table where it belongs; returns its rows."""
     # A gate is not scored where no sensor fails, nor where there is none.
     rows = [
         {"row": row, "model": model} | cell
-        for (row, model), by_seed in held.items()
+        for (row, model), by_seed in load_runs(config).items()
         for cell in column_cells(by_seed, METRICS)
     ]
-    return rows, compare_columns(held, PAIRS)
-
-
-def write(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Put the table and its comparisons where they belong; returns both."""
-    rows, pairs = collect(config)
     if rows and not config.validation:
         record_table(
             config.results / f"{NAME}.json",
@@ -233,9 +226,9 @@ def write(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
             TITLE,
             rows,
             preset=config.preset,
-            comparisons=pairs,
+            compared=[Compared("accuracy", PAIRS)],
         )
-    return rows, pairs
+    return rows
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -258,12 +251,12 @@ def main(config: Config) -> dict[str, Any]:
                 write_json(run.path(config), found)
                 write(config)
                 bar.advance(task)
-    rows, pairs = write(config)
+    rows = write(config)
     for row in rows:
         if row["metric"] == "accuracy":
             print(f"{row['row']:26} {row['model']:22} {row['mean']:6.2f} % of {row['n']} seeds")
-    print_result(study=NAME, runs=len(todo), comparisons=len(pairs))
-    return {"comparisons": pairs}
+    print_result(study=NAME, runs=len(todo), cells=len(rows))
+    return {"rows": rows}
 
 
 if __name__ == "__main__":

@@ -5,12 +5,22 @@ from __future__ import annotations
 import json
 from collections.abc import Iterable, Mapping, Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, NamedTuple
 
 from snn_fusion_failure.records.intervals import interval
 from snn_fusion_failure.runs import repository
 from snn_fusion_failure.runs.files import write_json
 from snn_fusion_failure.runs.origin import check_recordable, provenance
+
+
+class Compared(NamedTuple):
+    """Columns of a table that are compared seed by seed, in one metric."""
+
+    metric: str
+    pairs: tuple[tuple[str, str], ...]
+    """(column, column that is taken from it)."""
+    factor: float = 1.0
+    """What makes points of the metric."""
 
 
 def summarize(values: Sequence[float]) -> dict[str, Any]:
@@ -27,7 +37,7 @@ def summarize(values: Sequence[float]) -> dict[str, Any]:
 def column_cells(
     by_seed: Mapping[int, Mapping[str, Any]], metrics: Mapping[str, str]
 ) -> list[dict[str, Any]]:
-    """Metric, unit and summary of every metric that all seeds of a column have.
+    """Metric, unit, seeds and summary of every metric that all seeds of a column have.
 
     Args:
         by_seed: seed -> scores; a score that was not taken is missing, None or NaN.
@@ -37,33 +47,39 @@ def column_cells(
     for metric, unit in metrics.items():
         values: list[Any] = [scores.get(metric) for scores in by_seed.values()]
         if not any(v is None or v != v for v in values):
-            cells.append({"metric": metric, "unit": unit} | summarize(values))
+            cell = {"metric": metric, "unit": unit, "seeds": list(by_seed)}
+            cells.append(cell | summarize(values))
     return cells
 
 
 def compare_columns(
-    held: Mapping[tuple[str, str], Mapping[int, Mapping[str, Any]]],
-    pairs: Iterable[tuple[str, str]],
-    metric: str = "accuracy",
+    rows: Iterable[Mapping[str, Any]], compared: Iterable[Compared]
 ) -> list[dict[str, Any]]:
     """Differences between columns seed by seed, with Holm's correction over all of them.
 
     Args:
-        held: (row, column) -> seed -> scores.
-        pairs: (column, column that is taken from it); pairs of fewer than two common seeds are
-            left out.
-        metric: the score that is compared.
+        rows: of a table of record; a row without `seeds` has those from 0 on.
+        compared: what is compared; the first one's cases have the rows' names, those of others
+            name the metric too. Pairs of fewer than two common seeds are left out.
     """
     from snn_fusion_failure.records.statistics import holm, paired_test
 
-    chosen, found = list(pairs), []
-    for row in dict.fromkeys(name for name, _ in held):
-        for one, other in chosen:
-            a, b = held.get((row, one), {}), held.get((row, other), {})
-            if len(common := sorted(set(a) & set(b))) < 2:
-                continue
-            test = paired_test(*([t[s][metric] for s in common] for t in (a, b)))
-            found.append({"row": row, "comparison": f"{one} - {other}", **test._asdict()})
+    held: dict[str, dict[tuple[str, str], dict[int, float]]] = {}
+    for cell in rows:
+        values = cell.get("values", ())
+        by_seed = dict(zip(cell.get("seeds", range(len(values))), values, strict=True))
+        held.setdefault(cell["metric"], {})[cell["row"], cell["model"]] = by_seed
+    found = []
+    for place, (metric, pairs, factor) in enumerate(compared):
+        columns = held.get(metric, {})
+        for row in dict.fromkeys(name for name, _ in columns):
+            case = f"{row}, {metric.replace('_', ' ')}" if place else row
+            for one, other in pairs:
+                a, b = columns.get((row, one), {}), columns.get((row, other), {})
+                if len(common := sorted(set(a) & set(b))) < 2:
+                    continue
+                test = paired_test(*([factor * t[s] for s in common] for t in (a, b)))
+                found.append({"row": case, "comparison": f"{one} - {other}", **test._asdict()})
     for pair, p in zip(found, holm([pair["p_value"] for pair in found]), strict=True):
         pair["p_holm"] = p
     return found
@@ -84,13 +100,13 @@ def record_table(
     rows: Iterable[dict[str, Any]],
     *,
     preset: str,
-    comparisons: list[dict[str, Any]] | None = None,
+    compared: Iterable[Compared] = (),
 ) -> None:
     """Write or update a table of record; rows are replaced by (row, model, metric), others stay.
 
-    Every row keeps the command and the commit that made it, and `comparisons` are those of
-    `compare_columns`; the interval of a share is one that
-    stays within 0 and 100 %. Numbers of code that was changed and not committed are refused in
+    Every row keeps the command and the commit that made it. What is `compared` is worked out from
+    all rows of the table, those of earlier commands too. The interval of a share is one that stays
+    within 0 and 100 %. Numbers of code that was changed and not committed are refused in
     `results/`, and kept under `runs/refused/` instead, unless `SFF_ALLOW_DIRTY=1` is set; their
     `git` field ends in `-dirty`.
 
@@ -114,6 +130,7 @@ def record_table(
     new = {key(row) for row in rows}
     kept = [row for row in recorded(path) if key(row) not in new]
     held = {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows}
+    comparisons = compare_columns(held["rows"], compared)
     write_json(path, held | ({"comparisons": comparisons} if comparisons else {}))
 
 

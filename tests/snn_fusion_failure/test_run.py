@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.rows import Compared, record_table, summarize
 from snn_fusion_failure.runs import (
     WorkFailedError,
     append_metrics,
@@ -161,6 +161,34 @@ def test_interval_is_student_s(n: int) -> None:
 
 def test_one_run_has_no_interval() -> None:
     assert summarize([4.0]) == {"n": 1, "mean": 4.0, "ci95": None, "values": [4.0]}
+
+
+def test_a_table_that_grows_compares_the_columns_of_earlier_commands_too(tmp_path: Path) -> None:
+    path = tmp_path / "study_x.json"
+    compared = [
+        Compared("accuracy", (("b", "a"), ("c", "a"))),
+        Compared("auroc", (("b", "a"),), 100),
+    ]
+
+    def record(**columns: tuple[float, ...]) -> list[dict[str, Any]]:
+        rows = [
+            {"row": "clean", "model": model, "metric": metric, "seeds": list(range(len(values)))}
+            | {"values": [scale * v for v in values]}
+            for model, values in columns.items()
+            for metric, scale in (("accuracy", 1.0), ("auroc", 0.01))
+        ]
+        record_table(path, "x", "X", rows, preset="paper", compared=compared)
+        return list(json.loads(path.read_text()).get("comparisons", []))
+
+    assert record(a=(1.0, 2.0, 3.0)) == []
+    (first, auroc) = record(b=(2.0, 4.0, 6.0))
+    assert first["comparison"] == "b - a" and first["p_holm"] == pytest.approx(2 * first["p_value"])
+    assert auroc["row"] == "clean, auroc" and auroc["difference"] == pytest.approx(2.0)
+    found = record(c=(0.0, 0.0))
+    assert [pair["comparison"] for pair in found] == ["b - a", "c - a", "b - a"]
+    # Common seeds alone: 0 - 1 and 0 - 2; the smallest of three p values.
+    assert found[1]["difference"] == pytest.approx(-1.5)
+    assert found[0]["p_holm"] == pytest.approx(3 * first["p_value"])
 
 
 def test_a_table_grows_and_is_corrected(tmp_path: Path) -> None:

@@ -18,11 +18,18 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from brax.envs.base import Env, State, Wrapper
-from brax.envs.wrappers.training import EpisodeWrapper, VmapWrapper
+from brax.envs.wrappers.training import (
+    DomainRandomizationVmapWrapper,
+    EpisodeWrapper,
+    VmapWrapper,
+)
 from jaxtyping import Array
 
 from jaxsnn import navigation, world
+from jaxsnn._checks import require
+from jaxsnn.maps import stack_maps
 
 
 class PipelineState(NamedTuple):
@@ -61,10 +68,18 @@ class NavigationEnv(Env):
 
     Args:
         params: the map; it travels in `pipeline_state` and may be changed there.
+
+    Attributes:
+        sys: the map under the name by which brax's domain randomization changes it.
     """
 
     def __init__(self, params: world.WorldParams) -> None:
-        self.params = params
+        self.sys = params
+
+    @property
+    def params(self) -> world.WorldParams:
+        """The map."""
+        return self.sys
 
     def reset(self, rng: jax.Array) -> State:
         """A robot in a start circle; `rng` may be a raw or a typed key."""
@@ -151,6 +166,61 @@ class FreshResetWrapper(Wrapper):
         )
 
 
+def map_randomization(
+    maps: Sequence[world.WorldParams], **ranges: tuple[float, float]
+) -> Callable[[world.WorldParams, Array], tuple[world.WorldParams, world.WorldParams]]:
+    """A `randomization_fn` for brax's learners: a map, and constants of it, for each environment.
+
+    Args:
+        maps: each environment has one of them, equally likely.
+        ranges: name of a constant -> lowest and highest value, drawn uniformly; the scalars of
+            `WorldParams`: `speed`, `robot_radius`, `sonar_noise` ...
+
+    Returns:
+        The function of (map, keys `[n]`) that brax calls; its answer is a map for each key.
+
+    Raises:
+        ValueError: no map, an unknown constant, or limits that are not finite and in order.
+
+    Example:
+        >>> from jaxsnn import scenarios
+        >>> draw = map_randomization([scenarios.scenario(i) for i in (1, 2)], speed=(10.0, 20.0))
+        >>> found, _ = draw(scenarios.scenario(1), jax.random.split(jax.random.PRNGKey(0), 3))
+        >>> found.speed.shape
+        (3,)
+    """
+    stacked = stack_maps(maps)
+    scalars = [name for name, leaf in stacked._asdict().items() if np.ndim(leaf) == 1]
+    for name, limits in ranges.items():
+        require(
+            name in scalars,
+            f"{name}={limits}: expected a scalar of WorldParams; choose from {', '.join(scalars)}",
+        )
+        low, high = limits
+        require(
+            bool(np.isfinite([low, high]).all()) and low <= high,
+            f"{name}={limits}: expected two finite limits, the lower one first; put them in order",
+        )
+
+    def draw(key: Array) -> world.WorldParams:
+        first, *others = jax.random.split(_typed(key), 1 + len(ranges))
+        which = jax.random.randint(first, (), 0, len(maps))
+        drawn = {
+            name: jax.random.uniform(one, (), minval=low, maxval=high)
+            for one, (name, (low, high)) in zip(others, ranges.items(), strict=True)
+        }
+        return jax.tree.map(lambda leaf: leaf[which], stacked)._replace(**drawn)
+
+    def randomize(
+        sys: world.WorldParams, rng: Array
+    ) -> tuple[world.WorldParams, world.WorldParams]:
+        del sys  # brax's argument: all that an environment has comes from the drawn map.
+        found = jax.vmap(draw)(rng)
+        return found, jax.tree.map(lambda _: 0, found)
+
+    return randomize
+
+
 def wrap_for_training(
     env: Env,
     episode_length: int = 200,
@@ -159,16 +229,19 @@ def wrap_for_training(
 ) -> Wrapper:
     """Vmap, episode limit and fresh resets; pass it as `wrap_env_fn` to brax's learners.
 
-    Raises:
-        ValueError: `randomization_fn` is given: there is no brax system to randomize. Make
-            one `NavigationEnv` for each map instead.
+    Args:
+        env: a `NavigationEnv`.
+        episode_length: control steps after which an episode is over.
+        action_repeat: control steps per action.
+        randomization_fn: of `map_randomization`; brax's learners bind its keys. Each environment
+            keeps its map for the whole run, as brax has it.
     """
-    if randomization_fn is not None:
-        raise ValueError(
-            "randomization_fn needs a brax system, and this world has none; vary "
-            "NavigationEnv.params instead"
-        )
-    return FreshResetWrapper(EpisodeWrapper(VmapWrapper(env), episode_length, action_repeat))
+    batched = (
+        VmapWrapper(env)
+        if randomization_fn is None
+        else DomainRandomizationVmapWrapper(env, randomization_fn)
+    )
+    return FreshResetWrapper(EpisodeWrapper(batched, episode_length, action_repeat))
 
 
 def _device_put_replicated(x: Any, devices: Sequence[jax.Device]) -> Any:

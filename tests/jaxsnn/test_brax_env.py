@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import functools
 import io
 from typing import Any
 
@@ -96,9 +97,45 @@ def test_brax_wrappers_run_and_reset(brax_env: Any, env: Any) -> None:
     assert (np.ptp(starts["fresh"], axis=0) > 0).all()
 
 
-def test_randomization_is_refused(brax_env: Any, env: Any) -> None:
-    with pytest.raises(ValueError, match="needs a brax system"):
-        brax_env.wrap_for_training(env, randomization_fn=lambda s: s)
+@pytest.mark.slow
+def test_every_environment_drives_on_a_map_of_its_own(brax_env: Any, env: Any) -> None:
+    maps = [scenarios.scenario(number) for number in (1, 3)]
+    draw = brax_env.map_randomization(maps, speed=(5.0, 10.0), sonar_noise=(0.0, 2.0))
+    keys = jax.random.split(jax.random.PRNGKey(4), 32)
+    wrapped = brax_env.wrap_for_training(
+        env, episode_length=3, randomization_fn=functools.partial(draw, rng=keys)
+    )
+    first = jax.jit(wrapped.reset)(keys)
+    drawn = first.pipeline_state.params
+    targets = {tuple(np.asarray(target)) for target in drawn.target}
+    assert targets == {tuple(np.asarray(one.target)) for one in maps}
+    assert 5.0 <= drawn.speed.min() < 6.0 and 9.0 < drawn.speed.max() <= 10.0
+    assert len(np.unique(drawn.sonar_noise)) == 32
+    state, step = first, jax.jit(wrapped.step)
+    for _ in range(4):  # one more than an episode
+        before = state.pipeline_state.robot
+        state = step(state, jnp.zeros((32, 1)))
+        robot = state.pipeline_state.robot
+        moved = np.hypot(robot.x - before.x, robot.y - before.y)
+        np.testing.assert_allclose(moved[robot.t > 0], drawn.speed[robot.t > 0], rtol=1e-3)
+    np.testing.assert_array_equal(state.pipeline_state.params.target, drawn.target)
+    assert env.sys is env.params and env.params.speed.ndim == 0
+
+
+@pytest.mark.parametrize(
+    ("ranges", "message"),
+    [
+        ({"sped": (1.0, 2.0)}, r"sped=.*expected a scalar of WorldParams; choose from .*speed"),
+        ({"target": (1.0, 2.0)}, "target=.*expected a scalar"),
+        ({"speed": (2.0, 1.0)}, "speed=.*the lower one first"),
+        ({"speed": (1.0, float("inf"))}, "speed=.*two finite limits"),
+    ],
+)
+def test_randomization_of_what_is_no_constant_is_refused(
+    brax_env: Any, ranges: dict, message: str
+) -> None:
+    with pytest.raises(ValueError, match=message):
+        brax_env.map_randomization([scenarios.scenario(1)], **ranges)
 
 
 def test_the_shim_is_still_needed_and_leaves_no_trace(brax_env: Any) -> None:
@@ -172,3 +209,29 @@ def test_ppo_of_brax_learns(brax_env: Any, env: Any) -> None:
             progress_fn=lambda n, m: seen.append((n, float(m["eval/episode_arrived"]))),
         )
     assert seen[-1][1] > 0.8  # share of 64 trials that arrive
+
+
+@pytest.mark.slow
+def test_ppo_of_brax_learns_on_several_maps_at_once(brax_env: Any, env: Any) -> None:
+    from brax.training.agents.ppo import train
+
+    maps = [scenarios.scenario(number) for number in (1, 2)]
+    seen: list[float] = []
+    with brax_env.brax_compatibility():
+        train.train(
+            env,
+            wrap_env_fn=brax_env.wrap_for_training,
+            randomization_fn=brax_env.map_randomization(maps, speed=(12.0, 15.0)),
+            num_timesteps=60_000,
+            episode_length=80,
+            num_envs=32,
+            batch_size=32,
+            num_minibatches=4,
+            unroll_length=20,
+            learning_rate=1e-3,
+            discounting=0.97,
+            num_eval_envs=64,
+            num_evals=2,
+            progress_fn=lambda n, m: seen.append(float(m["eval/episode_arrived"])),
+        )
+    assert seen[-1] > max(0.6, seen[0] + 0.1), seen

@@ -2,6 +2,7 @@
 
     python scripts/studies/study_detour.py --models blind reflex_60 reflex_100 q_learning
     python scripts/studies/study_detour.py --models S4 S4_literal S1 S2 S3 --seeds 16
+    python scripts/studies/study_detour.py --models S4_way --seeds 8 --choose
 
 Rows are the three scenarios, their detour readings D1 to D3 (`jaxsnn.scenarios.detour`) and the
 held-out detour family: there a learner trains on one map of the family's training split and drives
@@ -10,7 +11,10 @@ after the source's 20 learning trials (2,000 for Q-learning, about 10,000 for PP
 counts progress along the shortest way), `sr_testing_60_trials` with `--learn-trials 60`, and
 `path_ratio` of the trials that arrived. `S4` is the reading "tuned", `S4_literal` the source's,
 `S4_guided` the one with a graded reward, `S4_way` the one whose trainer knows the way, as PPO's.
-Networks use the seeds of the tables of record from 0 on.
+Networks use the seeds of the tables of record from 0 on. `--choose` trains on several maps of the
+training split, one after the other, and drives on maps of the validation split, which says what a
+map is worth as a teacher (`results/study_detour_choice.json`); the row `held-out detour family,
+chosen map` trains on the best of them, the row without that on the first map there is.
 
 Rows go to `results/study_detour.json` as each one ends; one that is there already with as many
 seeds is skipped, so the study can be broken off and gone on with. Drivers take seconds, Q-learning
@@ -23,18 +27,25 @@ import dataclasses
 import time
 from typing import Any
 
+from snn_fusion_failure.records.detour_rows import (
+    CHOSEN,
+    ROWS,
+    is_family,
+    tested_maps,
+    train_map,
+    trials_per_map,
+    values_of,
+)
 from snn_fusion_failure.records.rows import record_table, recorded, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, progress, repository, run_command
 from snn_fusion_failure.runs.origin import check_recordable
 
-ROWS = ("Scenario 1", "Scenario 2", "Scenario 3", "D1", "D2", "D3", "held-out detour family")
 DRIVERS = ("blind", "reflex_60", "reflex_100")
 NETWORKS = (
     *("S1", "S2", "S3", "S4", "S4_literal", "S4_guided", "S3_guided"),
     *("S1_way", "S2_way", "S3_way", "S4_way"),
 )
 LEARNERS = ("q_learning", "ppo")
-FAMILY = ROWS[-1]
 UNITS = {"path_ratio": "1"}
 PPO: dict[str, Any] = {
     "n_envs": 32,
@@ -60,53 +71,26 @@ class Study:
     """Of the networks: 20 (the source) or 60 for the second column."""
     family_maps: int = 20
     """Unseen maps of the family, one trial of each robot on each."""
+    choose: bool = False
+    """Train on maps of the training split, test on maps of the validation split."""
+    teachers: int = 8
+    """Training maps that are compared (`--choose`)."""
     max_steps: int = 200
     block: int = 8
     max_minutes: float = 25.0
     """No row is begun after so many minutes of CPU time."""
 
 
-def train_map(row: str) -> Any:
-    """The map that a learner trains on."""
-    from jaxsnn import families, scenarios
-
-    if row == FAMILY:
-        return families.family_map("detour", "train", 0)
-    if row.startswith("D"):
-        return scenarios.detour(int(row[1:]))
-    return scenarios.scenario(int(row.removeprefix("Scenario ")))
+def _tests(config: Study, row: str) -> tuple[int, list[Any]]:
+    """Trials on each map of the test of a row, and these maps."""
+    split = "validation" if config.choose else "test"
+    return trials_per_map(row, config.test_trials), tested_maps(row, config.family_maps, split)
 
 
-def test_maps(config: Study, row: str) -> list[Any]:
-    """The maps of the testing trials."""
-    from jaxsnn import families
-
-    if row != FAMILY:
-        return [train_map(row)]
-    return [families.family_map("detour", "test", i) for i in range(config.family_maps)]
-
-
-def trials_per_map(config: Study, row: str) -> int:
-    """Testing trials of each robot on each map."""
-    return 1 if row == FAMILY else config.test_trials
-
-
-def values_of(maps: list[Any], status: Any, path: Any, starts: Any) -> dict[str, list[float]]:
-    """One value per robot from `[maps, robots, trials]` of status, path and start points."""
-    import numpy as np
-
-    from jaxsnn import planner
-    from jaxsnn.status import Status
-
-    arrived = status == Status.ARRIVED
-    ratio = np.full(path.shape, np.nan)
-    for i, map in enumerate(maps):
-        if arrived[i].any():
-            points = starts[i][arrived[i]].astype(np.float64)
-            ratio[i][arrived[i]] = path[i][arrived[i]] / planner.path_field(map).lengths(points)
-    robots = range(status.shape[1])
-    ratios = [float(np.nanmean(ratio[:, r])) for r in robots if arrived[:, r].any()]
-    return {"sr_testing": (100.0 * arrived.mean(axis=(0, 2))).tolist(), "path_ratio": ratios}
+def _seeds(config: Study) -> range:
+    # A choice is made with seeds that no table of record has.
+    first = 1000 if config.choose else 0
+    return range(first, first + config.seeds)
 
 
 def run_driver(config: Study, model: str, row: str) -> dict[str, list[float]]:
@@ -133,8 +117,8 @@ def _test(config: Study, row: str, phase: Any, jnp: Any, np: Any) -> dict[str, l
     from jaxsnn.experiment import phase_keys, seed_keys
     from jaxsnn.trials import start_states
 
-    n, maps = trials_per_map(config, row), test_maps(config, row)
-    roots = jax.vmap(lambda k: phase_keys(k)[2])(seed_keys(jnp.arange(config.seeds)))
+    n, maps = _tests(config, row)
+    roots = jax.vmap(lambda k: phase_keys(k)[2])(seed_keys(jnp.asarray(_seeds(config))))
     status, path, points = [], [], []
     starts = jax.jit(
         lambda map, keys: jax.vmap(lambda k: start_states(map, key=k, n_trials=n))(keys)
@@ -161,13 +145,13 @@ def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
 
     name, _, reading = model.partition("_")
     network, params = preset(name, reading or "tuned")
-    scenario = int(row[-1]) if row != FAMILY else 1
+    scenario = 1 if is_family(row) else int(row[-1])
     learn = make_runner(
         network, training_map(network, train_map(row)), n_learn=config.learn_trials, n_test=1,
         max_steps=config.max_steps, block=config.block, keep_states=True,
         circles=learning_circles(scenario, config.learn_trials),
     )  # fmt: skip
-    states = jax.tree.map(jnp.asarray, learn(range(config.seeds), params).states)
+    states = jax.tree.map(jnp.asarray, learn(_seeds(config), params).states)
     frozen = agents.snn_agent(network, plastic=False)
     constants = jax.tree.map(jnp.float32, agents.snn_params(network, params))
 
@@ -175,7 +159,7 @@ def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
     def test(map: Any, words: Any, states: Any, constants: Any) -> Any:
         return trials.run_phase(
             frozen, constants, map, states, keys=jax.random.wrap_key_data(words),
-            n_trials=trials_per_map(config, row), max_steps=config.max_steps,
+            n_trials=trials_per_map(row, config.test_trials), max_steps=config.max_steps,
         )[1]  # fmt: skip
 
     def phase(map: Any, keys: Any, n: int) -> Any:
@@ -239,7 +223,7 @@ def _test_learners(config: Study, row: str, drive: Any) -> dict[str, list[float]
 
     from jaxsnn.status import Status
 
-    n, maps = trials_per_map(config, row), test_maps(config, row)
+    n, maps = _tests(config, row)
     done = [drive(m, jax.random.key(37 + i), n) for i, m in enumerate(maps)]
     status = np.where(np.stack([d.arrived for d in done]), Status.ARRIVED, Status.TIMEOUT)
     return values_of(
@@ -257,17 +241,22 @@ def runner(model: str) -> Any:
 def main(config: Study) -> dict[str, float]:
     """Run the cells that are missing; returns success by model and row."""
     known = (*DRIVERS, *LEARNERS, *NETWORKS)
-    for name, given, allowed in (("models", config.models, known), ("rows", config.rows, ROWS)):
+    possible = (*ROWS, CHOSEN)
+    for name, given, allowed in (("models", config.models, known), ("rows", config.rows, possible)):
         if unknown := [g for g in given if g not in allowed]:
             raise ValueError(f"{name}={unknown}: expected some of {list(allowed)}; choose")
     if config.learn_trials not in (20, 60):
         raise ValueError(f"learn_trials={config.learn_trials}: expected 20 or 60; choose one")
     check_recordable()
     enable_compilation_cache()
-    path = repository.RESULTS / "study_detour.json"
+    chosen_by = "_choice" if config.choose else ""
+    path = repository.RESULTS / f"study_detour{chosen_by}.json"
+    title = f"{TITLE}: what training maps are worth on validation maps" if config.choose else TITLE
+    teachers = tuple(f"detour/train/{i}" for i in range(config.teachers))
+    rows = teachers if config.choose else config.rows
     held = {(r["model"], r["row"], r["metric"]) for r in recorded(path) if r["n"] >= config.seeds}
     metric = "sr_testing" if config.learn_trials == 20 else "sr_testing_60_trials"
-    cells = [(m, r) for m in config.models for r in config.rows if (m, r, metric) not in held]
+    cells = [(m, r) for m in config.models for r in rows if (m, r, metric) not in held]
     start, found = time.process_time(), {}
     with progress() as bar:
         task = bar.add_task("cells", total=len(cells), status="")
@@ -277,12 +266,12 @@ def main(config: Study) -> dict[str, float]:
             values = runner(model)(config, model, row)
             if config.learn_trials != 20:
                 values = {metric: values["sr_testing"]}
-            rows = [
+            new = [
                 {"row": row, "model": model, "metric": name, "unit": UNITS.get(name, "%"),
                  **summarize(v)}
                 for name, v in values.items() if v
             ]  # fmt: skip
-            record_table(path, path.stem, TITLE, rows, preset=f"{config.seeds} robots")
+            record_table(path, path.stem, title, new, preset=f"{config.seeds} robots")
             found[f"{model} {row}"] = sum(values[metric]) / len(values[metric])
             bar.update(task, advance=1, status=f"{model}, {row}: {found[f'{model} {row}']:.0f} %")
             print(model, row, round(found[f"{model} {row}"], 1), flush=True)
@@ -291,7 +280,8 @@ def main(config: Study) -> dict[str, float]:
 
 def fields(done: dict[str, float]) -> dict[str, Any]:
     """What the result line says."""
-    return {"cells": len(done), "file": "results/study_detour.json"}
+    best = max(done, key=lambda name: done[name], default="none")
+    return {"cells": len(done), "best": best.replace(" ", "_")}
 
 
 if __name__ == "__main__":

@@ -11,7 +11,7 @@ from jaxsnn.world import WorldParams
 from snn_fusion_failure.records import detour_rows
 
 
-def _same(one: object, other: object) -> bool:
+def _same(one: WorldParams, other: WorldParams) -> bool:
     return bool(
         np.array_equal(one.segments, other.segments) and np.array_equal(one.circles, other.circles)
     )

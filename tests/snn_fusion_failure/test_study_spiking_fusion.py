@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -44,6 +45,18 @@ def test_single_runs_become_rows_and_paired_tests(tmp_path: Path) -> None:
     # Differences 2, 2.5 and 3: t = 2.5 / (0.5 / sqrt 3).
     assert seen["t"] == pytest.approx(2.5 / (0.5 / 3**0.5))
     assert unseen["row"] == "unseen kinds" and seen["p_holm"] == pytest.approx(2 * seen["p_value"])
+
+
+def test_rows_of_failing_sensors_are_averaged_seed_by_seed() -> None:
+    def cell(row: str, values: list[float], **more: Any) -> dict[str, Any]:
+        base = {"row": row, "model": "m", "metric": "accuracy", "n": len(values), "values": values}
+        return base | more
+
+    eight, five = (cell(row, [96.0, 93.0]) for row in study.FAILING[:2])
+    assert study.failing_means([eight, five]) == []
+    one = cell(study.FAILING[2], [60.0, 66.0], seeds=[1, 0])
+    (mean,) = study.failing_means([eight, five, one, cell("clean", [0.0, 0.0])])
+    assert mean["seeds"] == [0, 1] and mean["values"] == pytest.approx([86.0, 82.0])
 
 
 # optax raises a float to a whole power, which strict promotion forbids.

@@ -7,6 +7,7 @@ Chapter 4 of the source restores inactive features of a circuit so, by zeros or 
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -75,9 +76,18 @@ def rows_to_windows(
     config: ReversibleConfig, params: Params, rows: Float[Array, "n f"], sensor: int
 ) -> Float[Array, "n t"]:
     """Windows of one sensor from rows of its trunk's output."""
-    width = config.stage_channels()[-1]
-    z = rows.reshape(1, rows.shape[0], -1, width)
-    return inverse(config, sensor_params(params, sensor), z)[0, ..., 0]
+    return _own_windows(config, sensor_params(params, sensor), rows)
+
+
+def _own_windows(config: ReversibleConfig, own: Params, rows: Array) -> Array:
+    z = rows.reshape(1, rows.shape[0], -1, config.stage_channels()[-1])
+    return inverse(config, own, z)[0, ..., 0]
+
+
+@functools.partial(jax.jit, static_argnames="config")
+def _drawn_windows(config: ReversibleConfig, own: Params, drawn: Array) -> Array:
+    """Windows of every draw; compiled once for all sensors."""
+    return jax.lax.map(lambda rows: _own_windows(config, own, rows), drawn)
 
 
 def _moments(x: Array) -> tuple[Array, Array]:
@@ -192,6 +202,6 @@ def restore_windows(
     check_count("n_draws", n_draws)
     check_number("level", level, 0.0, 1.0, above=True, below=True, fix="0.9 is usual")
     drawn = draw_rows(restoration, inputs, n_draws, key=key)
-    own = jax.lax.map(lambda rows: rows_to_windows(config, params, rows, sensor), drawn)
+    own = _drawn_windows(config, sensor_params(params, sensor), drawn)
     ends = jnp.quantile(own, jnp.array([0.5 - level / 2.0, 0.5 + level / 2.0]), axis=0)
     return Restored(jnp.mean(own, axis=0), ends[0], ends[1])

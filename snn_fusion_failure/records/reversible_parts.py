@@ -127,7 +127,7 @@ def restorations(
     plain = r.fit_restoration(without(train, sensor), own)
     plain = r.spread_of_others(plain, without(held, sensor), held[:, sensor])
     found["line on windows"] = _drawn(plain, without(test, sensor), key=key)
-    found["line fitted on the same people (bound)"] = _crossed(test, sensor), None
+    found["line fitted on the same people too (bound)"] = _crossed(train, test, sensor), None
     for trunk, params in (("", main), (", trunk as drawn", drawn)):
         rows, seen, new = (r.trunk_rows(config, params, x) for x in (train, held, test))
         asked, target = without(new, sensor), rows[:, sensor]
@@ -140,23 +140,31 @@ def restorations(
             for name, outputs in (
                 ("zero features", zero),
                 ("Bayesian network on features", network),
+                ("Bayesian line on features, without draws", r.restored_rows(fit, asked)[0]),
                 ("its own features", new[:, sensor]),
             ):
                 found[name] = r.rows_to_windows(config, params, outputs, sensor), None
+            # No inverse: are the others' features to blame, or the coordinates of its own?
+            straight = r.fit_restoration(without(rows, sensor), own)
+            found["Bayesian line from features to windows"] = (
+                r.restored_rows(straight, asked)[0],
+                None,
+            )
         for spread, of in spreads.items():
             back = r.restore_windows(config, params, of, asked, sensor, key=key, level=LEVEL)
             found[f"Bayesian line on features{trunk}{spread}"] = back.mean, (back.low, back.high)
     return found
 
 
-def _crossed(test: Any, sensor: int) -> Any:
-    """A line between windows, told by one half of the test windows for the other."""
+def _crossed(train: Any, test: Any, sensor: int) -> Any:
+    """A line between windows, told by training rows and one half of the test for the other half."""
     from fusion.reversible import restoration as r
 
     half = len(test) // 2
     found = []
     for told, asked in ((test[half:], test[:half]), (test[:half], test[half:])):
-        fit = r.fit_restoration(without(told, sensor), told[:, sensor])
+        rows = jnp.concatenate([train, told])
+        fit = r.fit_restoration(without(rows, sensor), rows[:, sensor])
         found.append(r.restored_rows(fit, without(asked, sensor))[0])
     return jnp.concatenate(found)
 

@@ -8,40 +8,21 @@ from __future__ import annotations
 
 from collections.abc import Callable
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jax import lax
 from jaxtyping import Array, Float
 
+from fusion.lattice.half_spaces import half_spaces, shortfall
+from fusion.lattice.interior import ORDER_SLACK
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.projections import dykstra, isotonic
 from fusion.lattice.rounding import frame, onto, working
 
-
-def interior(config: LatticeConfig, signs: np.ndarray | Array) -> np.ndarray | Array:
-    """A lattice `[*sizes]` with slack >= 1 in every order and trust inequality, from 0 upwards."""
-    index = np.indices(config.sizes).astype(np.float32)
-    # A product of two centred indices is at most this steep; order terms must outweigh it.
-    sizes = config.sizes
-    steep = 1 + 0.5 * sum(max(sizes[m], sizes[c]) - 1 for m, c, _ in config.edgeworth_trust)
-    shape = np.zeros(config.sizes, np.float32)
-    for main, conditional, direction in config.edgeworth_trust:
-        pair = [index[axis] - np.float32(0.5 * (sizes[axis] - 1)) for axis in (main, conditional)]
-        shape = shape + np.float32(direction) * pair[0] * pair[1]
-    for axis, sign in enumerate(config.unimodality or ()):
-        shape = shape + np.float32(steep * sign) * np.abs(index[axis] - config.centre(axis))
-    shape = shape - shape.min()
-    for axis, size in enumerate(config.sizes):
-        if isinstance(signs, np.ndarray):
-            rising = index[axis] * np.maximum(signs[axis], 0)
-            falling = (size - 1 - index[axis]) * np.maximum(-signs[axis], 0)
-            shape = shape + np.float32(steep) * (rising + falling).astype(np.float32)
-        else:
-            traced = signs[axis].astype(jnp.float32)
-            rising = index[axis] * jnp.maximum(traced, 0.0)
-            falling = (size - 1 - index[axis]) * jnp.maximum(-traced, 0.0)
-            shape = shape + np.float32(steep) * (rising + falling)
-    return shape
+# Rounding to steps moves a vertex by half a step, and so does the arithmetic before it: both
+# together take twice `2 * Relation.slack` from a row, in steps.
+_SLACK = 4.0
 
 
 def _part(v: Array, axis: int, start: int, stop: int) -> Array:
@@ -66,34 +47,6 @@ def _flank(axis: int, start: int, stop: int, sign: int) -> Callable[[Array], Arr
         flank = isotonic(_part(v, axis, start, stop) * sign, axis) * sign
         n = v.shape[axis]
         return jnp.concatenate([_part(v, axis, 0, start), flank, _part(v, axis, stop, n)], axis)
-
-    return project
-
-
-def _mixed(v: Array, main: int, conditional: int) -> Array:
-    """Second differences of all 2 x 2 cells of two axes."""
-    return jnp.diff(jnp.diff(v, axis=main), axis=conditional)
-
-
-def _trust(
-    main: int, conditional: int, direction: int, first: tuple[int, int]
-) -> Callable[[Array], Array]:
-    """Trust in every second cell of two axes, from cell `first`: these cells share no vertex."""
-
-    def project(v: Array) -> Array:
-        mixed = _mixed(v, main, conditional) * direction
-        chosen = np.zeros(mixed.shape, bool)
-        where = [slice(None)] * v.ndim
-        where[main], where[conditional] = slice(first[0], None, 2), slice(first[1], None, 2)
-        chosen[tuple(where)] = True
-        shift = jnp.where(chosen, 0.25 * direction * jnp.maximum(-mixed, 0.0), 0.0)
-        for i in (0, 1):
-            for j in (0, 1):
-                padding = [(0, 0, 0)] * v.ndim
-                padding[main], padding[conditional] = (i, 1 - i, 0), (j, 1 - j, 0)
-                corner = lax.pad(shift, jnp.zeros((), v.dtype), padding)
-                v = v + corner if i == j else v - corner
-        return v
 
     return project
 
@@ -128,34 +81,33 @@ def project_vertices(
     for axis, bend in centres.items():
         sets.append(_flank(axis, 0, config.centre(axis) + 1, -bend))
         sets.append(_flank(axis, config.centre(axis), config.sizes[axis], bend))
-    for main, conditional, direction in config.edgeworth_trust:
-        for i in range(min(2, config.sizes[main] - 1)):
-            for j in range(min(2, config.sizes[conditional] - 1)):
-                sets.append(_trust(main, conditional, direction, (i, j)))
+    for relation in config.relations:
+        sets += half_spaces(relation)
 
     if not sets and config.output_range == (None, None):
         return v
-    kind, trust = v.dtype, bool(config.edgeworth_trust)
-    # Rounding four corners to steps bends a cell by two steps at most: trust keeps three.
-    ramp = interior(config, signs) if trust else np.zeros(config.sizes, np.float32)
-    least = 4.0 * (float(np.max(ramp)) + 2.0) if trust else 1.0
+    kind, related = v.dtype, bool(config.relations)
+    inside = config.interior.vertices if related else np.zeros(config.sizes)
+    ties = config.interior.ties if related else None
+    height = float(inside.max())
+    least = (_SLACK + 1.0) * (height + 2.0) if related else 1.0
     place = frame(v, config.output_range, least=least)
     v = working(v) - place.centre
-    slack = place.step * (3.0 if trust else 0.0)
-    ramp = jnp.asarray(ramp, v.dtype)
+    slack = place.step * (_SLACK if related else 0.0)
+    ramp = jnp.asarray(inside, v.dtype)
     floor = None if place.low is None else place.low - place.centre + slack
-    ceiling = (
-        None if place.high is None else place.high - place.centre - slack * (jnp.max(ramp) + 1.0)
-    )
+    ceiling = None if place.high is None else place.high - place.centre - slack * (height + 1.0)
 
     def clip(v: Array) -> Array:
         v = v if floor is None else jnp.maximum(v, floor)
         return v if ceiling is None else jnp.minimum(v, ceiling)
 
     # The clipped projection onto order constraints is the projection onto order and bounds; with
-    # trust it is not, and the bounds are one more set to iterate over.
-    if trust and (floor is not None or ceiling is not None):
+    # constraints between inputs it is not, and the bounds are one more set to iterate over.
+    if related and (floor is not None or ceiling is not None):
         sets.append(clip)
+    if ties is not None:
+        sets.append(lambda v: _tie(v, ties))
     v = v - slack * ramp
     v = dykstra(v, sets, config.n_iterations)
     if len(sets) > 1:
@@ -164,8 +116,10 @@ def project_vertices(
         for axis, bend in centres.items():
             v = _repair_unimodal(v, axis, config.centre(axis), bend)
     v = clip(v)
-    if trust:
-        v = _repair_trust(config, v, ramp, floor, ceiling)
+    if ties is not None:
+        v = _tie(v, ties)
+    if related:
+        v = _repair_relations(config, v, ramp / height, floor, ceiling)
     return onto(place, v + slack * ramp + place.centre).astype(kind)
 
 
@@ -190,33 +144,33 @@ def _repair_unimodal(v: Array, axis: int, centre: int, sign: int) -> Array:
     return jnp.concatenate([left, _part(right, axis, 1, n - centre)], axis) * sign
 
 
-def _repair_trust(
-    config: LatticeConfig, v: Array, ramp: Array, floor: Array | None, ceiling: Array | None
+def _tie(v: Array, ties: np.ndarray) -> Array:
+    """The mean of each class of vertices that must be equal."""
+    _, classes, members = np.unique(ties.ravel(), return_inverse=True, return_counts=True)
+    sums = jax.ops.segment_sum(v.ravel(), classes, num_segments=len(members))
+    return (sums / jnp.asarray(members, v.dtype))[classes].reshape(v.shape)
+
+
+def _repair_relations(
+    config: LatticeConfig, v: Array, target: Array, floor: Array | None, ceiling: Array | None
 ) -> Array:
     """Step towards a lattice inside all constraints, just far enough to end every violation."""
     bottom = jnp.min(v) if floor is None else floor
     top = jnp.max(v) if ceiling is None else ceiling
-    target = bottom + (top - bottom) * ramp / jnp.max(ramp)
-    slack = (top - bottom) / jnp.max(ramp)
-    worst = _trust_violation(config, v)
+    room = (top - bottom) / jnp.asarray(config.interior.vertices.max(), v.dtype)
+    worst = _disorder(config, config.signs, v) / jnp.asarray(ORDER_SLACK, v.dtype)
+    for relation in config.relations:
+        lack = shortfall(relation, v) / jnp.asarray(relation.slack[:, None], v.dtype)
+        worst = jnp.maximum(worst, jnp.max(lack))
     rounding = 8 * jnp.finfo(v.dtype).eps * (jnp.abs(bottom) + jnp.abs(top))
-    share = (worst + rounding) / (worst + rounding + slack)
+    share = (worst + rounding) / (worst + rounding + room)
+    target = bottom + (top - bottom) * target
     return v + jnp.where(worst > 0, share, 0.0) * (target - v)
 
 
-def _trust_violation(config: LatticeConfig, v: Array) -> Array:
+def _disorder(config: LatticeConfig, signs: np.ndarray | Array, v: Array) -> Array:
+    """Largest violation of monotonicity or unimodality, at least 0."""
     worst = jnp.zeros((), v.dtype)
-    for main, conditional, direction in config.edgeworth_trust:
-        worst = jnp.maximum(worst, jnp.max(-direction * _mixed(v, main, conditional)))
-    return worst
-
-
-def violation(
-    config: LatticeConfig, signs: np.ndarray | Array, v: Float[Array, "*sizes"]
-) -> Float[Array, ""]:
-    """Largest violation of any inequality between vertices, or of the bounds; 0 for none."""
-    v = working(v)
-    worst = _trust_violation(config, v)
     for axis in range(v.ndim):
         sign = jnp.asarray(signs[axis], v.dtype)
         worst = jnp.maximum(worst, jnp.max(-sign * jnp.diff(v, axis=axis)))
@@ -227,6 +181,17 @@ def violation(
         right = _part(slopes, axis, centre, v.shape[axis] - 1)
         worst = jnp.maximum(worst, jnp.max(left, initial=0.0))
         worst = jnp.maximum(worst, jnp.max(-right, initial=0.0))
+    return worst
+
+
+def violation(
+    config: LatticeConfig, signs: np.ndarray | Array, v: Float[Array, "*sizes"]
+) -> Float[Array, ""]:
+    """Largest violation of any inequality between vertices, or of the bounds; 0 for none."""
+    v = working(v)
+    worst = _disorder(config, signs, v)
+    for relation in config.relations:
+        worst = jnp.maximum(worst, jnp.max(shortfall(relation, v)))
     low, high = config.output_range
     if low is not None:
         worst = jnp.maximum(worst, low - jnp.min(v))

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import functools
 from typing import Literal, NamedTuple
 
 import numpy as np
@@ -15,6 +16,8 @@ from fusion.lattice.checks import (
     require_signs,
     require_static,
 )
+from fusion.lattice.interior import Interior, interior
+from fusion.lattice.relations import BUILDERS, Relation
 
 
 class LatticeParams(NamedTuple):
@@ -40,6 +43,17 @@ class LatticeConfig:
         n_iterations: passes of Dykstra's algorithm where there is more than one family of
             constraints; what is left after them is repaired exactly. 10 is enough in training,
             where each step starts next to the feasible set.
+        trapezoid_trust: triples `(main, conditional, direction)`: the range of outputs over the
+            monotone main input widens (+1) or narrows (-1) with the free conditional input.
+        dominance: pairs `(dominant, weak)` of monotone inputs: the slope in the first is at least
+            as steep, per vertex.
+        range_dominance: such pairs: the range of outputs over the first is at least as wide.
+        joint_monotonicity: triples `(first, second, direction)`: outputs rise (+1) or fall (-1)
+            where both inputs grow by the same amount.
+        joint_unimodality: pairs `((inputs), direction)`: outputs rise (+1, valley) or fall (-1,
+            peak) along each ray from the middle vertex of these free inputs of 3 or more vertices.
+
+    Dominance and the joint constraints bound slopes, and need interpolation "hypercube".
 
     Raises:
         ValueError: sizes or constraints mean nothing or contradict each other.
@@ -57,6 +71,11 @@ class LatticeConfig:
     output_range: tuple[float | None, float | None] = (None, None)
     interpolation: Literal["hypercube", "simplex"] = "hypercube"
     n_iterations: int = 10
+    trapezoid_trust: tuple[tuple[int, int, int], ...] = ()
+    dominance: tuple[tuple[int, int], ...] = ()
+    range_dominance: tuple[tuple[int, int], ...] = ()
+    joint_monotonicity: tuple[tuple[int, int, int], ...] = ()
+    joint_unimodality: tuple[tuple[tuple[int, ...], int], ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse sizes and constraints that mean nothing or contradict each other."""
@@ -77,7 +96,6 @@ class LatticeConfig:
                     f"0 for input {axis}, which is both monotone and unimodal",
                     "set one of the two to 0",
                 )
-        self._check_trust()
         require_range("output_range", self.output_range)
         if self.interpolation not in ("hypercube", "simplex"):
             raise refusal(
@@ -87,31 +105,37 @@ class LatticeConfig:
                 "choose one",
             )
         require_count("n_iterations", self.n_iterations)
+        self._check_relations()
 
-    def _check_trust(self) -> None:
-        directions: dict[frozenset[int], int] = {}
-        for trust in self.edgeworth_trust:
-            good = isinstance(trust, tuple) and len(trust) == 3
-            if (
-                not good
-                or not all(0 <= axis < self.rank for axis in trust[:2])
-                or trust[0] == trust[1]
-                or trust[2] not in (-1, 1)
-            ):
+    def _check_relations(self) -> None:
+        for name in BUILDERS:
+            if not isinstance(getattr(self, name), tuple):
                 raise refusal(
-                    "edgeworth_trust",
-                    trust,
-                    "(main, conditional, direction) with two different inputs of "
-                    f"0..{self.rank - 1} and direction -1 or 1",
-                    "name inputs by their position",
+                    name, getattr(self, name), "a tuple of constraints", "write () for none"
                 )
-            if directions.setdefault(frozenset(trust[:2]), trust[2]) != trust[2]:
+        directions: dict[tuple[str, frozenset], int] = {}
+        for relation in self.relations:
+            pair, direction = frozenset(relation.axes), relation.value[-1]
+            symmetric = relation.name in ("edgeworth_trust", "joint_monotonicity")
+            if symmetric and directions.setdefault((relation.name, pair), direction) != direction:
                 raise refusal(
-                    "edgeworth_trust",
-                    self.edgeworth_trust,
-                    f"one direction for inputs {trust[0]} and {trust[1]}, not opposite directions",
+                    relation.name, getattr(self, relation.name),
+                    f"one direction for inputs {relation.axes}, not opposite directions",
                     "keep one of the two",
-                )
+                )  # fmt: skip
+            if self.interpolation == "simplex" and relation.name in _OF_SLOPES:
+                raise refusal(
+                    "interpolation", self.interpolation, f"'hypercube' beside {relation.name}, "
+                    "which bounds slopes of the multilinear function only", "write 'hypercube'",
+                )  # fmt: skip
+        if self.relations and _interior(self) is None:
+            culprit = next((r for r in reversed(self.relations) if _fits(self, r)), None)
+            culprit = culprit or self.relations[-1]
+            raise refusal(
+                culprit.name, culprit.value, "a constraint that leaves room to the others; with "
+                "them it leaves only lattices that are flat somewhere",
+                "drop it, or one of those that it contradicts",
+            )  # fmt: skip
 
     @property
     def rank(self) -> int:
@@ -126,3 +150,48 @@ class LatticeConfig:
     def centre(self, axis: int) -> int:
         """The vertex where a unimodal input has its extreme."""
         return self.sizes[axis] // 2
+
+    @property
+    def steps(self) -> tuple[np.ndarray, ...]:
+        """For each input and each step from a vertex to the next -1 (falls), 0 or 1 (rises)."""
+        made = []
+        for axis, (size, sign) in enumerate(zip(self.sizes, self.signs, strict=True)):
+            turn = self.unimodality[axis] if self.unimodality else 0
+            after = np.arange(size - 1) >= self.centre(axis)
+            made.append(np.where(after, turn, -turn) if turn else np.full(size - 1, sign))
+        return tuple(made)
+
+    @property
+    def relations(self) -> tuple[Relation, ...]:
+        """The constraints between inputs, as rows of inequalities."""
+        return _relations(self)
+
+    @property
+    def interior(self) -> Interior:
+        """A lattice inside all constraints but the bounds, and what they force to be equal."""
+        found = _interior(self)
+        assert found is not None
+        return found
+
+
+_OF_SLOPES = ("dominance", "joint_monotonicity", "joint_unimodality")
+
+
+@functools.lru_cache(maxsize=128)
+def _relations(config: LatticeConfig) -> tuple[Relation, ...]:
+    return tuple(
+        build(name, entry, config.sizes, config.signs)
+        for name, build in BUILDERS.items()
+        for entry in getattr(config, name)
+    )
+
+
+@functools.lru_cache(maxsize=128)
+def _interior(config: LatticeConfig) -> Interior | None:
+    return interior(config.sizes, config.steps, config.relations)
+
+
+def _fits(config: LatticeConfig, without: Relation) -> bool:
+    """Whether the constraints leave room when one of them is dropped."""
+    rest = [relation for relation in config.relations if relation is not without]
+    return interior(config.sizes, config.steps, rest) is not None

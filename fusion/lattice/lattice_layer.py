@@ -36,20 +36,23 @@ def init(key: Key[Array, ""], config: LatticeConfig) -> LatticeParams:
     if high is None:
         high = low + 1.0
     # On the host, but for the coins: a thousand vertices are not worth a compiled program for each
-    # operation. Only trust needs a projection: every order holds in a plane.
+    # operation. Only constraints between inputs need a projection: every order holds in a plane.
     index = np.indices(config.sizes)
     fixed = np.zeros(config.sizes)
     free = []
+    leans, turns = _joint(config)
     for axis, size in enumerate(config.sizes):
         fraction = index[axis] / (size - 1) - 0.5
         unimodal = config.unimodality[axis] if config.unimodality else 0
+        unimodal = unimodal or turns[axis]
+        lean = int(config.signs[axis]) or leans[axis]
         if unimodal:
             centre = config.centre(axis)
             fixed += unimodal * (
                 np.abs(index[axis] - centre) / max(centre, size - 1 - centre) - 0.5
             )
-        elif config.signs[axis]:
-            fixed += config.signs[axis] * fraction
+        elif lean:
+            fixed += lean * fraction
         else:
             free.append((axis, fraction))
     scale = (high - low) / config.rank
@@ -58,9 +61,19 @@ def init(key: Key[Array, ""], config: LatticeConfig) -> LatticeParams:
         axes, fractions = (np.stack(part) for part in zip(*free, strict=True))
         coin = jax.random.rademacher(key, (config.rank,), dtype=jnp.float32)[axes]
         plane = plane + jnp.tensordot(coin, jnp.asarray(scale * fractions, jnp.float32), 1)
-    if config.edgeworth_trust:
+    if config.relations:
         return project(config, LatticeParams(plane))
     return LatticeParams(_settle(plane, config.output_range))
+
+
+def _joint(config: LatticeConfig) -> tuple[np.ndarray, np.ndarray]:
+    """Of free inputs: directions that joint monotonicity, and turns that joint unimodality asks."""
+    leans, turns = np.zeros(config.rank, int), np.zeros(config.rank, int)
+    for first, second, direction in config.joint_monotonicity:
+        leans[[first, second]] += direction
+    for axes, direction in config.joint_unimodality:
+        turns[list(axes)] = direction
+    return np.sign(leans), turns
 
 
 @functools.partial(jax.jit, static_argnums=1)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import itertools
+from collections.abc import Callable
 
 import numpy as np
 from scipy.optimize import minimize
@@ -85,4 +86,49 @@ def lattice_rows(
     return np.array(rows).reshape(-1, total)
 
 
-__all__ = ["lattice_rows", "order_rows", "project"]
+def _corner_weights(sizes: tuple[int, ...], cell: tuple, at: np.ndarray) -> np.ndarray:
+    """Weights of all vertices in the multilinear function of one cell, also beyond its corners."""
+    weights = np.zeros(sizes)
+    for corner in itertools.product((0, 1), repeat=len(sizes)):
+        share = np.prod([t if bit else 1 - t for bit, t in zip(corner, at, strict=True)])
+        weights[tuple(np.add(cell, corner))] += share
+    return weights.ravel()
+
+
+def slope_rows(sizes: tuple[int, ...], direction: Callable[[np.ndarray], np.ndarray]) -> np.ndarray:
+    """One row for each corner of each cell: the slope there along `direction(corner)`.
+
+    Within a cell a slope along a direction that is linear in the place is linear in each input, so
+    that what holds at the corners holds in between.
+    """
+    rows = []
+    for cell in itertools.product(*(range(size - 1) for size in sizes)):
+        for corner in itertools.product((0.0, 1.0), repeat=len(sizes)):
+            at, here = np.array(corner), _corner_weights(sizes, cell, np.array(corner))
+            along = direction(at + cell)
+            rows.append(
+                sum(
+                    along[d] * (_corner_weights(sizes, cell, at + step) - here)
+                    for d, step in enumerate(np.eye(len(sizes)))
+                )
+            )
+    return np.array(rows)
+
+
+def range_rows(
+    sizes: tuple[int, ...], ends: Callable[[np.ndarray], list[tuple[int, int, float]]]
+) -> np.ndarray:
+    """One row for each vertex: the sum of `weight * theta` where input `axis` is set to `value`."""
+    index = np.arange(int(np.prod(sizes))).reshape(sizes)
+    rows = []
+    for vertex in itertools.product(*(range(size) for size in sizes)):
+        row = np.zeros(index.size)
+        for axis, value, weight in ends(np.array(vertex)):
+            at = list(vertex)
+            at[axis] = value
+            row[index[tuple(at)]] += weight
+        rows.append(row)
+    return np.array(rows)
+
+
+__all__ = ["lattice_rows", "order_rows", "project", "range_rows", "slope_rows"]

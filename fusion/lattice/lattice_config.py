@@ -128,14 +128,8 @@ class LatticeConfig:
                     "interpolation", self.interpolation, f"'hypercube' beside {relation.name}, "
                     "which bounds slopes of the multilinear function only", "write 'hypercube'",
                 )  # fmt: skip
-        if self.relations and _interior(self) is None:
-            culprit = next((r for r in reversed(self.relations) if _fits(self, r)), None)
-            culprit = culprit or self.relations[-1]
-            raise refusal(
-                culprit.name, culprit.value, "a constraint that leaves room to the others; with "
-                "them it leaves only lattices that are flat somewhere",
-                "drop it, or one of those that it contradicts",
-            )  # fmt: skip
+        if self.relations:
+            _ = self.interior
 
     @property
     def rank(self) -> int:
@@ -169,9 +163,7 @@ class LatticeConfig:
     @property
     def interior(self) -> Interior:
         """A lattice inside all constraints but the bounds, and what they force to be equal."""
-        found = _interior(self)
-        assert found is not None
-        return found
+        return _interior(self)
 
 
 _OF_SLOPES = ("dominance", "joint_monotonicity", "joint_unimodality")
@@ -187,11 +179,20 @@ def _relations(config: LatticeConfig) -> tuple[Relation, ...]:
 
 
 @functools.lru_cache(maxsize=128)
-def _interior(config: LatticeConfig) -> Interior | None:
-    return interior(config.sizes, config.steps, config.relations)
-
-
-def _fits(config: LatticeConfig, without: Relation) -> bool:
-    """Whether the constraints leave room when one of them is dropped."""
-    rest = [relation for relation in config.relations if relation is not without]
-    return interior(config.sizes, config.steps, rest) is not None
+def _interior(config: LatticeConfig) -> Interior:
+    relations = config.relations
+    found = interior(config.sizes, config.steps, relations)
+    if found is not None:
+        return found
+    # Name a constraint without which there is room, the last one given if there are several.
+    culprit = relations[-1]
+    for relation in reversed(relations):
+        rest = [other for other in relations if other is not relation]
+        if interior(config.sizes, config.steps, rest) is not None:
+            culprit = relation
+            break
+    raise refusal(
+        culprit.name, culprit.value, "a constraint that leaves room to the others; with them it "
+        "leaves only lattices that are flat somewhere",
+        "drop it, or one of those that it contradicts",
+    )  # fmt: skip

@@ -62,7 +62,7 @@ def init(key: Key[Array, ""], config: LatticeConfig) -> LatticeParams:
         coin = jax.random.rademacher(key, (config.rank,), dtype=jnp.float32)[axes]
         plane = plane + jnp.tensordot(coin, jnp.asarray(scale * fractions, jnp.float32), 1)
     if config.relations:
-        return project(config, LatticeParams(plane))
+        return _feasible(config, LatticeParams(plane))
     return LatticeParams(_settle(plane, config.output_range))
 
 
@@ -201,3 +201,7 @@ def vertices(
 ) -> tuple[tuple[np.ndarray, ...], Float[Array, "*sizes"]]:
     """Coordinates along each input, and the table of outputs over them."""
     return tuple(np.arange(size, dtype=np.float32) for size in config.sizes), params.vertices
+
+
+# One program instead of one for each of its operations.
+_feasible = functools.partial(jax.jit, static_argnums=0)(project)

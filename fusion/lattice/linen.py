@@ -11,9 +11,9 @@ from typing import Any
 
 import flax.linen as nn
 import jax.numpy as jnp
-from jaxtyping import Array, Float, Int
+from jaxtyping import Array, Bool, Float, Int
 
-from fusion.lattice import categorical, cdf, deep_lattice, ensemble, kronecker, pwl
+from fusion.lattice import aggregation, categorical, cdf, deep_lattice, ensemble, kronecker, pwl
 from fusion.lattice import linear as linear_layer
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.tagged import init_tagged, layer_of
@@ -126,3 +126,27 @@ class CDF(_Layer):
     def __call__(self, x: Float[Array, "*batch n_inputs"]) -> Float[Array, "*batch n_outputs"]:
         """Outputs in [0, 1]."""
         return self._apply(self.config, x, self.param_dtype)
+
+
+class Aggregation(_Layer):
+    """Function of a set of items, `[..., n_items, n_features]` and a mask `-> [...]`."""
+
+    config: aggregation.AggregationConfig
+    param_dtype: Any = jnp.float32
+
+    @nn.compact
+    def __call__(
+        self,
+        x: Float[Array, "*items n_features"],
+        mask: Bool[Array, "*items"] | None = None,
+        *,
+        segment_ids: Int[Array, " n_rows"] | None = None,
+        n_examples: int | None = None,
+    ) -> Float[Array, "..."]:
+        """The output of each set, given by a mask or by the number of the example of each row.
+
+        Raises:
+            ValueError: neither `mask` nor both of `segment_ids` and `n_examples`, or all of them.
+        """
+        params = self.param("layer", init_tagged, self.config, self.param_dtype)
+        return aggregation.apply_either(self.config, params, x, mask, segment_ids, n_examples)

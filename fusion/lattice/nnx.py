@@ -13,8 +13,9 @@ import jax
 import jax.numpy as jnp
 import optax
 from flax import nnx
-from jaxtyping import Array, Float, Shaped
+from jaxtyping import Array, Bool, Float, Int, Shaped
 
+from fusion.lattice import aggregation
 from fusion.lattice.categorical import CategoricalConfig
 from fusion.lattice.cdf import CDFConfig
 from fusion.lattice.checks import refusal
@@ -30,7 +31,7 @@ from fusion.lattice.tagged import init_tagged, layer_of
 def _named(params: Any) -> dict[str, Any]:
     """The arrays of a layer by flat names, such as `embedding_weights`."""
     return {
-        "_".join(entry.name for entry in path): leaf
+        "_".join(str(getattr(entry, "name", getattr(entry, "idx", ""))) for entry in path): leaf
         for path, leaf in jax.tree_util.tree_leaves_with_path(params)
     }
 
@@ -103,6 +104,23 @@ class CDF(_Layer):
     """Rising functions of soft steps, `[..., n_inputs] -> [..., n_outputs]`."""
 
     config: CDFConfig
+
+
+class Aggregation(_Layer):
+    """Function of a set of items; see the `linen` module of the same name."""
+
+    config: aggregation.AggregationConfig
+
+    def __call__(
+        self,
+        x: Float[Array, "*items n_features"],
+        mask: Bool[Array, "*items"] | None = None,
+        *,
+        segment_ids: Int[Array, " n_rows"] | None = None,
+        n_examples: int | None = None,
+    ) -> Float[Array, "..."]:
+        """The output of each set."""
+        return aggregation.apply_either(self.config, self.params, x, mask, segment_ids, n_examples)
 
 
 def _layers(model: nnx.Module) -> list[tuple[tuple[Any, ...], _Layer]]:

@@ -161,7 +161,8 @@ def dominance(name: str, value: Any, sizes: Sizes, signs: np.ndarray) -> Relatio
 
     with vertices counted in the directions in which outputs rise. Slopes are per vertex.
 
-    Source: TensorFlow Lattice's `monotonic_dominances`.
+    Source: Gupta et al. (2020), Multidimensional shape constraints; TensorFlow Lattice's
+    `monotonic_dominances`.
     """
     strong, weak, shape, at = _dominant(name, value, sizes, signs)
     rows = [
@@ -183,7 +184,8 @@ def range_dominance(name: str, value: Any, sizes: Sizes, signs: np.ndarray) -> R
 
     at every vertex `v`.
 
-    Source: TensorFlow Lattice's `range_dominances`.
+    Source: Gupta et al. (2020), Multidimensional shape constraints; TensorFlow Lattice's
+    `range_dominances`.
     """
     strong, weak, shape, at = _dominant(name, value, sizes, signs)
     top = (shape[0] - 1, shape[1] - 1)
@@ -202,7 +204,8 @@ def joint_monotonicity(name: str, value: Any, sizes: Sizes, signs: np.ndarray) -
 
     for direction +1: the sum of the two slopes, at both ends of the diagonal of each cell.
 
-    Source: TensorFlow Lattice's `joint_monotonicities`, which rise.
+    Source: Gupta et al. (2020), Multidimensional shape constraints; TensorFlow Lattice's
+    `joint_monotonicities`, which rise.
     """
     form = "(first, second, direction)"
     first, second, d = _inputs(name, value, len(sizes), form, directed=True)
@@ -227,7 +230,8 @@ def joint_unimodality(name: str, value: Any, sizes: Sizes, signs: np.ndarray) ->
     for direction +1, at every vertex `v` and towards each cell around it, whose directions are
     :math:`o_d = \pm 1`; :math:`n_d` is the number of vertices of input `d` of the group.
 
-    Source: TensorFlow Lattice's `joint_unimodalities`.
+    Source: Gupta et al. (2020), Multidimensional shape constraints; TensorFlow Lattice's
+    `joint_unimodalities`.
     """
     rank = len(sizes)
     good = isinstance(value, tuple) and len(value) == 2 and isinstance(value[0], tuple)

@@ -19,6 +19,7 @@ from flax.core import meta
 from jaxtyping import Array, Float
 
 from fusion.lattice import (
+    aggregation,
     categorical,
     cdf,
     deep_lattice,
@@ -42,6 +43,7 @@ LAYERS: dict[type, ModuleType] = {
     kronecker.KroneckerConfig: kronecker,
     cdf.CDFConfig: cdf,
     premade.CalibratedConfig: premade,
+    aggregation.AggregationConfig: aggregation,
 }
 """Configuration -> the module of functions that understands it."""
 

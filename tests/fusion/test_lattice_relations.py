@@ -156,10 +156,12 @@ def test_the_range_over_the_main_input_widens() -> None:
     f, x, y = _function("trapezoid"), _points(0), _points(1)
     less, more = np.minimum(x[:, 1], y[:, 1]), np.maximum(x[:, 1], y[:, 1])
     low, high = np.zeros(400), np.full(400, 2.0)
-    for end, sign in ((low, -1), (high, 1)):
-        rise = f(np.stack([end, more], 1)) - f(np.stack([end, less], 1))
-        assert np.min(sign * rise) > -1e-6
-        assert np.max(sign * rise) > 0.05
+    widened = [
+        sign * (f(np.stack([end, more], 1)) - f(np.stack([end, less], 1)))
+        for end, sign in ((low, -1), (high, 1))
+    ]
+    assert np.min(widened) > -1e-6
+    assert np.max(widened) > 0.05
 
 
 def test_a_step_in_the_dominant_input_does_more() -> None:
@@ -247,7 +249,7 @@ def test_no_violation_after_large_steps_of_a_flax_module(
 ) -> None:
     model = linen.Lattice(config, param_dtype=dtype)
     x = jnp.zeros((1, config.rank))
-    params = model.init(jax.random.key(0), x)
+    params = jax.jit(model.init)(jax.random.key(0), x)
     optimizer = with_projection(optax.chain(optax.scale_by_adam(), optax.scale(-0.7)))
 
     def step(carry: tuple, key: jax.Array) -> tuple:

@@ -40,6 +40,24 @@ KINDS: dict[str, tuple[Any, Any]] = {
         lattice_layer,
         lambda r: LatticeConfig((3, 3), (1, 0), edgeworth_trust=((0, 1, 1),), output_range=r),
     ),
+    "trapezoid": (
+        lattice_layer,
+        lambda r: LatticeConfig((3, 3), (1, 0), trapezoid_trust=((0, 1, 1),), output_range=r),
+    ),
+    "dominance": (
+        lattice_layer,
+        lambda r: LatticeConfig(
+            (3, 3), (1, -1), dominance=((0, 1),), trapezoid_trust=((1, 0, 1),), output_range=r
+        ),
+    ),
+    "joint": (
+        lattice_layer,
+        lambda r: LatticeConfig((3, 3), joint_monotonicity=((0, 1, 1),), output_range=r),
+    ),
+    "joint_valley": (
+        lattice_layer,
+        lambda r: LatticeConfig((4, 3), joint_unimodality=(((0, 1), 1),), output_range=r),
+    ),
     "linear": (linear, lambda r: LinearConfig(4, 2, (1, 1, -1, 0), dominance=((0, 1),))),
     "average": (linear, lambda r: LinearConfig(4, 1, (1, 1, 1, 1), normalized=True)),
 }
@@ -101,6 +119,10 @@ def _holds(kind: str, output_range: Range, dtype: str, seed: int) -> None:
         ("lattice", (1e5, 1e5 + 1), "float32"),
         ("convex", (1e3, 1e3 + 1), "float32"),
         ("trust", (0.0, 1.0), "float16"),
+        ("trapezoid", (-7.0, 0.1), "bfloat16"),
+        ("dominance", (1e3, 1e3 + 1), "float32"),
+        ("joint", (0.0, 1.0), "bfloat16"),
+        ("joint_valley", (0.3, None), "float16"),
     ],
 )
 def test_half_precision_and_offsets_leave_no_violation(

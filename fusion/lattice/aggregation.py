@@ -143,7 +143,7 @@ def apply(
     config: AggregationConfig,
     params: AggregationParams,
     x: Float[Array, "*batch n_items n_features"],
-    mask: Bool[Array, "*batch n_items"],
+    mask: Bool[Array, "..."],
 ) -> Float[Array, "*batch"]:
     r"""The output for each set of items.
 
@@ -157,7 +157,7 @@ def apply(
         config: of the function.
         params: of the function.
         x: items, padded to the same number; categories as whole numbers among the features.
-        mask: True where there is an item.
+        mask: `[*batch, n_items]`, True where there is an item.
 
     Returns:
         One number for each set; the same whatever the order of its items.
@@ -190,7 +190,7 @@ def apply_segments(
     config: AggregationConfig,
     params: AggregationParams,
     x: Float[Array, "n_rows n_features"],
-    segment_ids: Int[Array, " n_rows"],
+    segment_ids: Int[Array, "..."],
     n_examples: int,
 ) -> Float[Array, " n_examples"]:
     """As `apply`, for items as rows, each with the number of its example.
@@ -199,7 +199,7 @@ def apply_segments(
         config: of the function.
         params: of the function.
         x: the items of all examples.
-        segment_ids: the example of each row, in any order; other numbers are padding.
+        segment_ids: `[n_rows]`, the example of each row, in any order; other numbers are padding.
         n_examples: examples, a static number.
 
     Returns:
@@ -223,8 +223,8 @@ def apply_either(
     config: AggregationConfig,
     params: AggregationParams,
     x: Float[Array, "*items n_features"],
-    mask: Bool[Array, "*items"] | None,
-    segment_ids: Int[Array, " n_rows"] | None,
+    mask: Bool[Array, "..."] | None,
+    segment_ids: Int[Array, "..."] | None,
     n_examples: int | None,
 ) -> Float[Array, "..."]:
     """`apply` with a mask, `apply_segments` with the other two: what the flax modules call.

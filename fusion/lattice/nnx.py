@@ -114,9 +114,9 @@ class Aggregation(_Layer):
     def __call__(
         self,
         x: Float[Array, "*items n_features"],
-        mask: Bool[Array, "*items"] | None = None,
+        mask: Bool[Array, "..."] | None = None,
         *,
-        segment_ids: Int[Array, " n_rows"] | None = None,
+        segment_ids: Int[Array, "..."] | None = None,
         n_examples: int | None = None,
     ) -> Float[Array, "..."]:
         """The output of each set."""

@@ -80,9 +80,7 @@ def _mean(sums: Array, count: Array, empty: Array) -> Array:
 
 def padded(
     items: list[np.ndarray], n_items: int | None = None
-) -> tuple[
-    Float[np.ndarray, "n_examples n_items n_features"], Bool[np.ndarray, "n_examples n_items"]
-]:
+) -> tuple[Float[Array, "n_examples n_items n_features"], Bool[Array, "n_examples n_items"]]:
     """A list of examples of unequal length as one array and its mask.
 
     Args:
@@ -115,4 +113,4 @@ def padded(
     for i, example in enumerate(items):
         x[i, : len(example)] = example
         mask[i, : len(example)] = True
-    return x, mask
+    return jnp.asarray(x), jnp.asarray(mask)

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 from collections.abc import Callable
+from typing import Any
 
 import jax
 import jax.numpy as jnp
@@ -105,6 +106,11 @@ CASES: dict[str, tuple[LatticeConfig, np.ndarray]] = {
 }  # fmt: skip
 
 
+MANY = ("trapezoid_falling", "two_trapezoids", "range_dominance_falling", "joint_falling")
+EACH = [pytest.param(name, marks=pytest.mark.slow if name in MANY else ()) for name in CASES]
+"""Every case; those that take another program for what others show as well are slow."""
+
+
 @functools.cache
 def _projected(name: str) -> tuple[np.ndarray, np.ndarray]:
     """Two random lattices and the nearest ones inside the constraints."""
@@ -114,7 +120,7 @@ def _projected(name: str) -> tuple[np.ndarray, np.ndarray]:
     return x, np.asarray(project(x))
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", EACH)
 def test_projection_equals_qp(name: str) -> None:
     config, rows = CASES[name]
     orders = qp.lattice_rows(
@@ -194,7 +200,7 @@ def test_outputs_rise_along_every_ray_of_a_valley() -> None:
     assert np.min(f(x) - f(nearer)) > -1e-6
 
 
-@pytest.mark.parametrize("name", CASES)
+@pytest.mark.parametrize("name", EACH)
 def test_first_parameters_are_feasible_and_span_the_range(name: str) -> None:
     config = CASES[name][0]
     start = lattice_layer.init(jax.random.key(0), config)
@@ -228,25 +234,34 @@ def test_unconnected_inputs_take_no_programme_together() -> None:
     assert all(np.min(np.diff(found.vertices, axis=axis)) >= 0.5 for axis in range(13) if axis != 3)
 
 
+STEPPED = {
+    "trusts": LatticeConfig(
+        (3, 2, 3), (1, 1, 0), edgeworth_trust=((1, 2, 1),), trapezoid_trust=((0, 2, 1),),
+        dominance=((0, 1),), output_range=(0.0, 1.0),
+    ),
+    "joint": LatticeConfig(
+        (3, 3, 2), (0, 0, 1), joint_unimodality=(((0, 1), -1),), joint_monotonicity=((0, 2, 1),)
+    ),
+    "ranges": LatticeConfig(
+        (3, 3), (1, -1), range_dominance=((0, 1),), trapezoid_trust=((0, 1, 1),)
+    ),
+}  # fmt: skip
+
+
 @pytest.mark.relaxed  # flax and optax promote types
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
 @pytest.mark.parametrize(
-    "config",
+    ("name", "dtype"),
     [
-        LatticeConfig(
-            (3, 2, 3), (1, 1, 0), edgeworth_trust=((1, 2, 1),), trapezoid_trust=((0, 2, 1),),
-            dominance=((0, 1),), output_range=(0.0, 1.0),
-        ),
-        LatticeConfig(
-            (3, 3, 2), (0, 0, 1), joint_unimodality=(((0, 1), -1),), joint_monotonicity=((0, 2, 1),)
-        ),
-        LatticeConfig((3, 3), (1, -1), range_dominance=((0, 1),), trapezoid_trust=((0, 1, 1),)),
+        ("trusts", jnp.bfloat16),
+        ("joint", jnp.float32),
+        pytest.param("trusts", jnp.float32, marks=pytest.mark.slow),
+        pytest.param("joint", jnp.bfloat16, marks=pytest.mark.slow),
+        pytest.param("ranges", jnp.float32, marks=pytest.mark.slow),
+        pytest.param("ranges", jnp.bfloat16, marks=pytest.mark.slow),
     ],
-    ids=["trusts", "joint", "ranges"],
-)  # fmt: skip
-def test_no_violation_after_large_steps_of_a_flax_module(
-    config: LatticeConfig, dtype: jnp.dtype
-) -> None:
+)
+def test_no_violation_after_large_steps_of_a_flax_module(name: str, dtype: Any) -> None:
+    config = STEPPED[name]
     model = linen.Lattice(config, param_dtype=dtype)
     x = jnp.zeros((1, config.rank))
     params = jax.jit(model.init)(jax.random.key(0), x)

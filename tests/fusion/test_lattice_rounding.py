@@ -47,7 +47,7 @@ KINDS: dict[str, tuple[Any, Any]] = {
     "dominance": (
         lattice_layer,
         lambda r: LatticeConfig(
-            (3, 3), (1, -1), dominance=((0, 1),), trapezoid_trust=((1, 0, 1),), output_range=r
+            (3, 3), (1, -1), dominance=((0, 1),), trapezoid_trust=((0, 1, 1),), output_range=r
         ),
     ),
     "joint": (

@@ -148,5 +148,5 @@ class Aggregation(_Layer):
         Raises:
             ValueError: neither `mask` nor both of `segment_ids` and `n_examples`, or all of them.
         """
-        params = self.param("layer", init_tagged, self.config, self.param_dtype)
+        params: Any = self.param("layer", init_tagged, self.config, self.param_dtype)
         return aggregation.apply_either(self.config, params, x, mask, segment_ids, n_examples)

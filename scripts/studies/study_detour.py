@@ -13,8 +13,7 @@ counts progress along the shortest way), `sr_testing_60_trials` with `--learn-tr
 `S4_guided` the one with a graded reward, `S4_way` the one whose trainer knows the way, as PPO's.
 Networks use the seeds of the tables of record from 0 on. `--choose` trains on several maps of the
 training split, one after the other, and drives on maps of the validation split, which says what a
-map is worth as a teacher (`results/study_detour_choice.json`); the row `held-out detour family,
-chosen map` trains on the best of them, the row without that on the first map there is.
+map is worth as a teacher (`results/study_detour_choice.json`).
 
 Rows go to `results/study_detour.json` as each one ends; one that is there already with as many
 seeds is skipped, so the study can be broken off and gone on with. Drivers take seconds, Q-learning
@@ -28,7 +27,6 @@ import time
 from typing import Any
 
 from snn_fusion_failure.records.detour_rows import (
-    CHOSEN,
     ROWS,
     is_family,
     tested_maps,
@@ -241,8 +239,7 @@ def runner(model: str) -> Any:
 def main(config: Study) -> dict[str, float]:
     """Run the cells that are missing; returns success by model and row."""
     known = (*DRIVERS, *LEARNERS, *NETWORKS)
-    possible = (*ROWS, CHOSEN)
-    for name, given, allowed in (("models", config.models, known), ("rows", config.rows, possible)):
+    for name, given, allowed in (("models", config.models, known), ("rows", config.rows, ROWS)):
         if unknown := [g for g in given if g not in allowed]:
             raise ValueError(f"{name}={unknown}: expected some of {list(allowed)}; choose")
     if config.learn_trials not in (20, 60):

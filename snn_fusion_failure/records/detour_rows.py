@@ -5,15 +5,12 @@ from __future__ import annotations
 from typing import Any
 
 FAMILY = "held-out detour family"
-CHOSEN = f"{FAMILY}, chosen map"
 ROWS = ("Scenario 1", "Scenario 2", "Scenario 3", "D1", "D2", "D3", FAMILY)
-TEACHERS = {FAMILY: 0, CHOSEN: 0}
-"""Row -> training map of the family; that of the second by results/study_detour_choice.json."""
 
 
 def is_family(row: str) -> bool:
     """Whether a learner is tested on other maps than the one it learns on."""
-    return row in TEACHERS or row.startswith("detour/")
+    return row == FAMILY or row.startswith("detour/")
 
 
 def train_map(row: str) -> Any:
@@ -21,8 +18,8 @@ def train_map(row: str) -> Any:
     from jaxsnn import families, scenarios
     from jaxsnn.map_files import named_map
 
-    if row in TEACHERS:
-        return families.family_map("detour", "train", TEACHERS[row])
+    if row == FAMILY:
+        return families.family_map("detour", "train", 0)
     if is_family(row):
         return named_map(row)
     if row.startswith("D"):

@@ -114,8 +114,9 @@ def fit_restoration(
     noise by its evidence, R the covariance of the residuals and v the posterior variance.
 
     Args:
-        inputs, outputs: rows of `trunk_rows` of the working sensors, side by side, and of the
-            failed one, in training windows.
+        inputs: rows of `trunk_rows` of the working sensors, side by side, in training windows.
+        outputs: those of the failed one, or its windows themselves: `restored_rows` gives windows
+            then, and on HAR nearer ones than the way through the inverse does.
 
     Raises:
         ValueError: rows that differ in number, or fewer than two.

@@ -61,7 +61,8 @@ def _example(detector: Any) -> Any:
         rng.randint(0, 255, (*detector.image_size, 3)).astype(np.uint8),
         points.astype(np.float32), np.ones(n, bool), axes, p2,
         np.array([375.0, 1242.0], np.float32), np.array([0.0, -1, 0, 1.7], np.float32), truth,
-        np.arange(detector.max_objects) < 4,
+        np.arange(detector.max_objects) < 4, np.zeros(detector.max_objects, bool),
+        np.zeros((1, 4), np.float32),
     )  # fmt: skip
 
 

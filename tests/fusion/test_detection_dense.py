@@ -12,14 +12,21 @@ import pytest
 
 from fusion.detection.config import DenseConfig, DetectorConfig
 from fusion.detection.geometry.bev import BevConfig
+from fusion.detection.kitti.objects import concatenate, select
 from fusion.detection.learning.dense_objective import grid_losses
-from fusion.detection.learning.dense_targets import GridTargets, decode_cells, grid_targets
+from fusion.detection.learning.dense_targets import (
+    GridTargets,
+    decode_cells,
+    grid_targets,
+    ignored_cells,
+)
 from fusion.detection.learning.examples import make_example, make_inputs
 from fusion.detection.learning.fitting import fit_detector, run_detector
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.training import DetectorTrainConfig, fail_sensor
 from fusion.detection.network.build import count_main_parameters, init_detector
-from fusion.detection.network.dense import DenseDetector
+from fusion.detection.network.dense import N_OUTPUTS, DenseDetector
+from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.lifting import grid_centres, lift
 from fusion.detection.presets import preset
 from fusion.targets import check_targets
@@ -60,27 +67,95 @@ def test_lifted_features_are_those_of_the_projected_cells() -> None:
         assert float(jnp.abs(got[..., 2 * k][~inside]).max()) == 0.0
 
 
+def _inputs(truth: jax.Array, mask: jax.Array, **more: jax.Array) -> Inputs:
+    """What targets read of a frame; the rest is not there."""
+    none = jnp.zeros(0)
+    p2 = jnp.array([[70.0, 0, 48, 0], [0, 70, 16, 0], [0, 0, 1, 0]])
+    known = {"ignored": jnp.zeros(len(truth), bool), "regions": jnp.zeros((2, 4))} | more
+    return Inputs(
+        image=none, bev=none, anchors=none, anchor_mask=none, n_occupied=none, p2=p2,
+        image_size=jnp.array([32.0, 96.0]), plane=PLANE, truth=truth, truth_mask=mask, told=none,
+        **known,
+    )  # fmt: skip
+
+
 def test_targets_decode_to_the_labels() -> None:
     truth = jnp.array([[-2.4, 1.5, 9.4, 4.2, 1.7, 1.5, 0.3], [3.4, 1.6, 14.6, 3.6, 1.6, 1.4, -2.0],
                        [0.0, 0, 0, 1, 1, 1, 0]])  # fmt: skip
     mask = jnp.array([True, True, False])
-    got = jax.jit(partial(grid_targets, TINY))(truth, mask, PLANE)
+    targets = jax.jit(partial(grid_targets, TINY))
+    got = targets(_inputs(truth, mask))
     assert int(got.centre.sum()) == 2 and float(got.heat.max()) == 1.0
     assert 8 < int(got.near.sum()) < 30 and float(got.heat[0, 0]) < 1e-6
+    assert not got.ignored.any()
+    cells = [int((20 - z) / 0.5) * 32 + int((x + 8) / 0.5) for x, z in truth[:2, [0, 2]].tolist()]
+    assert got.centre.ravel()[jnp.array(cells)].all()
     boxes = decode_cells(TINY, got.boxes, PLANE)
-    for i in range(2):
-        column, row = int((truth[i, 0] + 8) / 0.5), int((20 - truth[i, 2]) / 0.5)
-        assert bool(got.centre[row, column])
-        np.testing.assert_allclose(boxes[row * 32 + column], truth[i], atol=1e-4)
-    none = grid_targets(TINY, truth, jnp.zeros(3, bool), PLANE)
+    np.testing.assert_allclose(boxes[jnp.array(cells)], truth[:2], atol=1e-4)
+    none = targets(_inputs(truth, jnp.zeros(3, bool)))
     assert float(none.heat.max()) == 0.0 and not bool(none.near.any())
+
+
+def test_an_axis_is_told_apart_from_its_direction() -> None:
+    # A network that cannot tell front from back: the mean of a car and of the car turned round.
+    truth = jnp.array([[-2.4, 1.5, 9.4, 4.2, 1.7, 1.5, 1.2]])
+    mask, cell = jnp.ones(1, bool), int((20 - 9.4) / 0.5) * 32 + int((8 - 2.4) / 0.5)
+    turned = truth.at[:, 6].add(jnp.pi)
+    told = [grid_targets(TINY, _inputs(t, mask)).boxes for t in (truth, turned)]
+    np.testing.assert_allclose(told[0][..., :8], told[1][..., :8], atol=1e-6)
+    unsure = 0.5 * told[0] + 0.5 * told[1]
+    for towards, heading in ((1e-3, 1.2), (-1e-3, 1.2 - np.pi)):
+        found = decode_cells(TINY, unsure + towards * told[0], PLANE)[cell]
+        np.testing.assert_allclose(found[6], heading, atol=1e-3)
+
+
+def test_vans_and_regions_that_nobody_labelled_are_neither_cars_nor_background() -> None:
+    truth = jnp.array([[-2.4, 1.6, 9.4, 4.2, 1.7, 1.5, 0.0], [3.4, 1.6, 14.6, 5.0, 2.0, 2.2, 1.57]])
+    car, van = jnp.array([True, False]), jnp.array([False, True])
+    u, v = 70 * 5.75 / 18.25 + 48, 70 * 0.8 / 18.25 + 16  # of the cell at (5.75, 18.25)
+    region = jnp.array([[u - 0.5, v - 0.05, u + 0.5, v + 0.05], [0, 0, 0, 0]])
+    got = grid_targets(TINY, _inputs(truth, car, ignored=van, regions=region))
+    assert int(got.centre.sum()) == 1
+    x, z = grid_centres(TINY)
+    on_van = (np.abs(x - 3.4) < 1.4) & (np.abs(z - 14.6) < 2.9)
+    in_region = (x == 5.75) & (z == 18.25)
+    assert got.ignored[on_van].all() and got.ignored[in_region].all()
+    assert not got.ignored[(np.abs(x - 3.4) > 1.6) & (z < 17)].any()
+    targets = jax.tree.map(lambda a: a[None], got)
+    outputs = jnp.zeros((1, 32, 32, N_OUTPUTS))
+    ghost = outputs.at[0, ..., 0].set(jnp.where(got.ignored, 9.0, 0.0))
+    for before, after in zip(*(grid_losses(o, targets) for o in (outputs, ghost)), strict=True):
+        np.testing.assert_allclose(before, after, rtol=1e-6)
+
+
+def test_frames_hold_vans_and_regions_which_are_mirrored() -> None:
+    frame = a_frame()
+    labels = frame.labels
+    assert labels is not None
+    labels.type[:] = ["Van", "Car"]
+    both = concatenate([labels, select(labels, np.array([0]))])
+    both.type[2], both.bbox[2] = "DontCare", (10.0, 6.0, 30.0, 14.0)
+    example, _ = make_example(TINY, dataclasses.replace(frame, labels=both))
+    assert example.truth_mask.tolist() == [True, False, False, False]
+    assert example.ignored.tolist() == [False, True, False, False]
+    np.testing.assert_allclose(example.truth[:2, 0], [3.4, -2.4], rtol=1e-6)
+    np.testing.assert_array_equal(example.regions[0], [10, 6, 30, 14])
+    read = jax.jit(lambda mirror: make_inputs(TINY, example, mirror=mirror))
+    plain, mirrored = read(jnp.array(False)), read(jnp.array(True))
+    np.testing.assert_array_equal(mirrored.regions[0], [65, 6, 85, 14])
+    np.testing.assert_array_equal(mirrored.regions[1:], 0)
+    cells = jax.jit(partial(ignored_cells, TINY))
+    there = cells(plain)
+    assert there.any()
+    np.testing.assert_array_equal(cells(mirrored), there[:, ::-1])
 
 
 def test_losses_by_hand() -> None:
     heat = jnp.array([[[1.0, 0.5], [0.0, 0.0]]])
     centre = heat == 1.0
-    targets = GridTargets(heat, centre, centre, jnp.zeros((1, 2, 2, 8)))
-    outputs = jnp.zeros((1, 2, 2, 9)).at[0, 0, 0, 1].set(2.0)
+    boxes = jnp.zeros((1, 2, 2, N_OUTPUTS - 1))
+    targets = GridTargets(heat, centre, centre, boxes, jnp.zeros_like(centre))
+    outputs = jnp.zeros((1, 2, 2, N_OUTPUTS)).at[0, 0, 0, 1].set(2.0)
     got = grid_losses(outputs, targets)
     # Heat 0.5 everywhere: 1/4 log 2 for the centre and for cold cells, a 16th of it beside it.
     np.testing.assert_allclose(got[0], 0.25 * np.log(2) * (1 + 2 + 0.5**4), rtol=1e-5)

@@ -73,7 +73,7 @@ def test_crops_are_those_of_the_boxes() -> None:
         anchors=none, anchor_mask=none, n_occupied=none,
         p2=jnp.array([[40.0, 0, 48, 0], [0, 40, 16, 0], [0, 0, 1, 0]]),
         image_size=jnp.array([32.0, 96.0]), plane=none, truth=none, truth_mask=none,
-        told=none,
+        ignored=none, regions=none, told=none,
     )  # fmt: skip
     boxes = jnp.array([[-3.0, 1.6, 12, 4, 1.6, 1.5, 0.0], [4.0, 1.6, 16, 4, 1.6, 1.5, 1.57]])
     params, stats = jax.jit(partial(init_detector, config=CONFIG))(jax.random.key(0))

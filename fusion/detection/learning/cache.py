@@ -20,7 +20,7 @@ from fusion.detection.config import TARGET_SIZES, TARGETS, DetectorConfig, Targe
 from fusion.detection.geometry.anchors import cluster_sizes
 from fusion.detection.geometry.planes import PlaneConfig
 from fusion.detection.kitti.files import frame_names, read_frame, read_labels, read_split
-from fusion.detection.learning.examples import Example, make_example
+from fusion.detection.learning.examples import MAX_REGIONS, Example, make_example
 from fusion.detection.presets import preset
 
 TESTING = "testing"
@@ -105,7 +105,11 @@ def read_example(folder: Path, name: str) -> Example:
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: run `prepare` first")
     with np.load(path) as held:
-        return Example(*(held[field] for field in Example._fields))
+        # Caches until 0.2 ignore nothing.
+        absent = {"ignored": np.zeros(len(held["truth"]), bool)}
+        absent["regions"] = np.zeros((MAX_REGIONS, 4), np.float32)
+        fields = (held[f] if f in held else absent[f] for f in Example._fields)
+        return Example(*fields)
 
 
 def split_frames(root: Path, splits: Sequence[str]) -> tuple[dict[str, tuple[str, ...]], int]:

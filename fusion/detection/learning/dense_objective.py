@@ -4,7 +4,8 @@ r"""What training of the one-stage detector minimizes, and its detections.
     L = L_{heat} + \rho \, L_{box} + \alpha \sum_k w_k L^{aux}_k
       + \beta \sum_k \big(w_k - f_k(L^{aux})\big)^2 + \dots
 
-The heat has a focal loss over all cells, divided by the number of cars; the box an absolute error
+The heat has a focal loss over all cells but the ignored ones (vans, DontCare regions), divided by
+the number of cars; the box an absolute error
 over the cells near one: a hit needs boxes right to a decimetre, where a smooth L1 hardly pulls.
 :math:`L^{aux}_k` is the same of a head that reads view k alone; the gate's terms are those of
 `gate_objective`.
@@ -41,7 +42,7 @@ def _per_frame(values: Array, counted: Array) -> Array:
 
 
 def grid_losses(
-    outputs: Float[Array, "b r s 9"], targets: GridTargets
+    outputs: Float[Array, "b r s 11"], targets: GridTargets
 ) -> tuple[Float[Array, "b"], Float[Array, "b"], Float[Array, "b"]]:
     """Heat, box and balanced class loss of every frame.
 
@@ -54,10 +55,12 @@ def grid_losses(
     losses = jnp.where(
         centre, -((1.0 - share) ** 2) * hot, -((1.0 - targets.heat) ** 4) * share**2 * cold
     )
+    losses = jnp.where(targets.ignored, 0.0, losses)
     n = jnp.maximum(1.0, centre.astype(logit.dtype).sum(axis=(1, 2)))
     heat = losses.sum(axis=(1, 2)) / n
     error = jnp.abs(outputs[..., 1:] - targets.boxes).sum(axis=-1)
-    balanced = 0.5 * _per_frame(-hot, centre) + 0.5 * _per_frame(-cold, targets.heat < 0.1)
+    background = (targets.heat < 0.1) & ~targets.ignored
+    balanced = 0.5 * _per_frame(-hot, centre) + 0.5 * _per_frame(-cold, background)
     return heat, _per_frame(error, targets.near), balanced
 
 
@@ -78,9 +81,7 @@ def dense_loss(
     grids: Grids = model.apply(main, inputs, method="encode")
     kept = drop_modalities(jnp.ones((2, b, 1)), config.path_drop, key=key)[:, :, 0].T
     outputs = model.apply(main, grids, 2.0 * grids.weights * kept, method="head")
-    targets = jax.vmap(lambda t, m, p: grid_targets(config, t, m, p))(
-        inputs.truth, inputs.truth_mask, inputs.plane
-    )
+    targets = jax.vmap(lambda frame: grid_targets(config, frame))(inputs)
     heat, boxes, _ = grid_losses(outputs, targets)
     gate = of_paths = regularization = jnp.zeros(())
     if config.gated:

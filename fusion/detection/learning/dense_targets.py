@@ -2,13 +2,16 @@ r"""What the cells of the grid should say about the labelled cars, and back.
 
 .. math::
     Y_{ij} = \max_g \exp\Big(-\frac{|c_{ij} - g|^2}{2 \sigma^2}\Big), \qquad
-    t = \Big(x_g - x, \; z_g - z, \; 2 (y_g - y_0), \; 2 \log\frac{d_g}{\bar d}, \; \cos r_g, \;
-      \sin r_g\Big)
+    t = \Big(x_g - x, \; z_g - z, \; 2 (y_g - y_0), \; 2 \log\frac{d_g}{\bar d}, \;
+      \cos 2 r_g, \; \sin 2 r_g, \; \cos r_g, \; \sin r_g\Big)
 
 for the centre c of a cell and the nearest car g, whose own cell has heat 1; :math:`\bar d` are mean
-sizes, :math:`y_0` is the ground below the car.
+sizes, :math:`y_0` is the ground below the car. The doubled angle tells the box's axis, and the
+plain one only which of the axis' two directions is the front: a scan hardly tells front from back,
+and the best guess at a vector that may as well be its opposite is short and points anywhere.
 
-Source: Zhou, Wang, Kraehenbuehl (2019), objects as points.
+Source: Zhou, Wang, Kraehenbuehl (2019), objects as points; axis and direction apart as in Ku et al.
+(2018), whose box has the axis and whose angle vector the direction.
 """
 
 from __future__ import annotations
@@ -20,8 +23,11 @@ import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from fusion.detection.config import DetectorConfig
+from fusion.detection.geometry.encodings import wrap_angle
+from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.lifting import grid_centres
 
+_MARGIN, _MIDDLE = 0.5, 0.8  # around ignored boxes, height of a car's middle [m]
 _LOG_LIMIT = 1.0  # sizes as factors of the mean, e to this at most
 
 
@@ -32,13 +38,15 @@ class GridTargets(NamedTuple):
         heat: `[r, s]` in [0, 1].
         centre: `[r, s]` cells of a car's centre.
         near: `[r, s]` cells that tell a box.
-        boxes: `[r, s, 8]` what they should tell.
+        boxes: `[r, s, 10]` what they should tell.
+        ignored: `[r, s]` cells that are neither object nor background.
     """
 
     heat: Array
     centre: Array
     near: Array
     boxes: Array
+    ignored: Array
 
 
 def _mean_size(config: DetectorConfig) -> np.ndarray:
@@ -49,19 +57,41 @@ def _ground(plane: Array, x: Array, z: Array) -> Array:
     return -(plane[0] * x + plane[2] * z + plane[3]) / plane[1]
 
 
-def grid_targets(
-    config: DetectorConfig,
-    truth: Float[Array, "g 7"],
-    mask: Bool[Array, "g"],
-    plane: Float[Array, "4"],
-) -> GridTargets:
-    """Targets of one frame, inside jit.
+def _inside_boxes(boxes: Array, mask: Array, x: Array, z: Array) -> Array:
+    """Which cells' centres lie in the footprint of a box, half a metre around it included."""
+    dx, dz = (a[None] - boxes[:, i, None, None] for a, i in ((x, 0), (z, 2)))
+    c, s = (f(boxes[:, 6])[:, None, None] for f in (jnp.cos, jnp.sin))
+    along, across = jnp.abs(c * dx - s * dz), jnp.abs(s * dx + c * dz)
+    sides = 0.5 * boxes[:, 3:5, None, None] + _MARGIN
+    within = (along < sides[:, 0]) & (across < sides[:, 1])
+    return (within & mask[:, None, None]).any(axis=0)
 
-    Args:
-        config: static.
-        truth, mask: labelled boxes, padded.
-        plane: ground plane.
+
+def _inside_regions(
+    regions: Float[Array, "d 4"], plane: Array, p2: Float[Array, "3 4"], x: Array, z: Array
+) -> Array:
+    """Which cells are seen in a DontCare region, at the height of a car's middle."""
+    points = jnp.stack([x, _ground(plane, x, z) - _MIDDLE, z, jnp.ones_like(x)], axis=-1)
+    seen = points @ p2.T
+    u, v = (seen[..., i] / jnp.maximum(seen[..., 2], 0.1) for i in (0, 1))
+    left, top, right, bottom = (regions[:, i, None, None] for i in range(4))
+    return ((u[None] > left) & (u[None] < right) & (v[None] > top) & (v[None] < bottom)).any(axis=0)
+
+
+def ignored_cells(config: DetectorConfig, inputs: Inputs) -> Bool[Array, "r s"]:
+    """Cells of one frame that are neither object nor background, inside jit.
+
+    They are those on a box of the neighbouring class (vans for cars, which the benchmark counts
+    neither as hits nor as misses) and those seen in a DontCare region of the picture.
     """
+    x, z = (jnp.asarray(a) for a in grid_centres(config))
+    on_box = _inside_boxes(inputs.truth, inputs.ignored, x, z)
+    return on_box | _inside_regions(inputs.regions, inputs.plane, inputs.p2, x, z)
+
+
+def grid_targets(config: DetectorConfig, inputs: Inputs) -> GridTargets:
+    """Targets of one frame, inside jit: reads its labelled boxes, ground plane and P2."""
+    truth, mask, plane = inputs.truth, inputs.truth_mask, inputs.plane
     d = config.dense
     x, z = (jnp.asarray(a) for a in grid_centres(config))
     square = (truth[:, 0, None, None] - x[None]) ** 2 + (truth[:, 2, None, None] - z[None]) ** 2
@@ -74,20 +104,24 @@ def grid_targets(
     nearest = truth[square.argmin(axis=0)]
     raised = nearest[..., 1] - _ground(plane, nearest[..., 0], nearest[..., 2])
     size = jnp.maximum(nearest[..., 3:6], 0.1) / jnp.asarray(_mean_size(config))[None, None]
+    heading = nearest[..., 6]
+    angles = [jnp.cos(2.0 * heading), jnp.sin(2.0 * heading), jnp.cos(heading), jnp.sin(heading)]
     boxes = jnp.concatenate(
         [
             jnp.stack([nearest[..., 0] - x, nearest[..., 2] - z, 2.0 * raised], axis=-1),
             2.0 * jnp.log(size),
-            jnp.stack([jnp.cos(nearest[..., 6]), jnp.sin(nearest[..., 6])], axis=-1),
+            jnp.stack(angles, axis=-1),
         ],
         axis=-1,
     )
     near = square.min(axis=0) < d.radius**2
-    return GridTargets(jnp.where(centre, 1.0, heat), centre, near | centre, boxes)
+    near = near | centre
+    ignored = ignored_cells(config, inputs) & ~near
+    return GridTargets(jnp.where(centre, 1.0, heat), centre, near, boxes, ignored)
 
 
 def decode_cells(
-    config: DetectorConfig, boxes: Float[Array, "r s 8"], plane: Float[Array, "4"]
+    config: DetectorConfig, boxes: Float[Array, "r s 10"], plane: Float[Array, "4"]
 ) -> Float[Array, "n 7"]:
     """3D boxes that the cells tell, in the order of the flattened grid."""
     x, z = (jnp.asarray(a) for a in grid_centres(config))
@@ -95,7 +129,9 @@ def decode_cells(
     y = _ground(plane, at_x, at_z) + 0.5 * boxes[..., 2]
     log_size = jnp.clip(0.5 * boxes[..., 3:6], -_LOG_LIMIT, _LOG_LIMIT)
     size = jnp.asarray(_mean_size(config))[None, None] * jnp.exp(log_size)
-    heading = jnp.arctan2(boxes[..., 7], boxes[..., 6])
+    axis = 0.5 * jnp.arctan2(boxes[..., 7], boxes[..., 6])
+    ahead = jnp.cos(axis) * boxes[..., 8] + jnp.sin(axis) * boxes[..., 9] >= 0.0
+    heading = wrap_angle(jnp.where(ahead, axis, axis + jnp.pi))
     return jnp.concatenate(
         [jnp.stack([at_x, y, at_z], axis=-1), size, heading[..., None]], axis=-1
     ).reshape(-1, 7)

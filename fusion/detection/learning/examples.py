@@ -18,12 +18,15 @@ from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.anchors import Anchors, anchor_grid, select_anchors
 from fusion.detection.geometry.bev import bev_maps
 from fusion.detection.geometry.planes import PlaneConfig, fit_plane, height_above
+from fusion.detection.kitti.average_precision import NEIGHBOUR
 from fusion.detection.kitti.calibration import in_image, lidar_to_camera, project
 from fusion.detection.kitti.files import Frame
+from fusion.detection.kitti.objects import DONT_CARE
 from fusion.detection.learning.augmentation import flip, in_area, turn_and_scale
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.sensors.depth import depth_image
 
+MAX_REGIONS = 8  # DontCare regions of a frame
 MEAN_RGB = (92.84 / 255, 97.80 / 255, 93.58 / 255)  # of the training images (AVOD)
 
 
@@ -38,7 +41,11 @@ class Example(NamedTuple):
         p2: `[3, 4]` projection into the image of the original size.
         image_size: `[2]` original rows and columns.
         plane: `[4]` ground plane.
-        truth, truth_mask: `[g, 7]` labelled boxes of the target class in the area, padded.
+        truth, truth_mask: `[g, 7]` labelled boxes in the area, padded, and which rows are of the
+            target class.
+        ignored: `[g]` rows of the neighbouring class (vans for cars), neither cars nor background.
+        regions: `[MAX_REGIONS, 4]` left, top, right, bottom of DontCare regions in pixels of the
+            original image; zeros for none.
     """
 
     image: np.ndarray | Array
@@ -50,6 +57,8 @@ class Example(NamedTuple):
     plane: np.ndarray | Array
     truth: np.ndarray | Array
     truth_mask: np.ndarray | Array
+    ignored: np.ndarray | Array
+    regions: np.ndarray | Array
 
 
 # Share of the points near the expected ground that lie on the fitted plane. With the camera 0.9 m
@@ -84,6 +93,33 @@ def _ground(frame: Frame, camera: np.ndarray, expected: PlaneConfig) -> np.ndarr
     return fit.plane
 
 
+def _labelled_boxes(config: DetectorConfig, frame: Frame) -> tuple[np.ndarray, np.ndarray, int]:
+    """Boxes `[g, 7]` of the target class and, after them, of its neighbour; which rows are the
+    latter's; how many of the former had no room."""
+    truth = np.zeros((config.max_objects, 7), np.float32)
+    ignored = np.zeros(config.max_objects, bool)
+    if frame.labels is None:
+        return truth, ignored, 0
+    labels = frame.labels
+    x, z = config.bev.x_range, config.bev.z_range
+    at_x, at_z = labels.location[:, 0], labels.location[:, 2]
+    # No anchor stands outside the area, and no feature map reaches there.
+    inside = (at_x > x[0]) & (at_x < x[1]) & (at_z > z[0]) & (at_z < z[1])
+    inside &= (labels.dimensions > 0).all(axis=1)
+    nearest = np.argsort(labels.location[:, 2], kind="stable")
+    wanted = nearest[(inside & (labels.type == config.target))[nearest]]
+    lost = max(0, len(wanted) - config.max_objects)
+    wanted = wanted[: config.max_objects]
+    others = nearest[(inside & (labels.type == NEIGHBOUR.get(config.target, "")))[nearest]]
+    rows = np.concatenate([wanted, others])[: config.max_objects]
+    n = len(rows)
+    truth[:n, :3] = labels.location[rows]
+    truth[:n, 3:6] = labels.dimensions[rows][:, [2, 1, 0]]
+    truth[:n, 6] = labels.rotation_y[rows]
+    ignored[len(wanted) : n] = True
+    return truth, ignored, lost
+
+
 def make_example(
     config: DetectorConfig, frame: Frame, ground: PlaneConfig | None = None
 ) -> tuple[Example, dict[str, int | bool]]:
@@ -96,7 +132,8 @@ def make_example(
 
     Returns:
         The example and counts: `plane_fitted`, `points_dropped` (in the image, over `max_points`),
-        `labels_dropped` (cars over `max_objects`, farthest first).
+        `labels_dropped` (cars over `max_objects`, farthest first). Vans take the rows that cars
+        leave free.
 
     Raises:
         ValueError: no lidar point lies in the image, no ground plane is found, too few points lie
@@ -124,22 +161,11 @@ def make_example(
     points = np.zeros((config.max_points, 4), np.float32)
     points[: len(kept)] = frame.points[kept]
 
-    truth = np.zeros((config.max_objects, 7), np.float32)
-    n_boxes = lost = 0
+    truth, ignored, lost = _labelled_boxes(config, frame)
+    regions = np.zeros((MAX_REGIONS, 4), np.float32)
     if frame.labels is not None:
-        labels = frame.labels
-        at_x, at_z = labels.location[:, 0], labels.location[:, 2]
-        # No anchor stands outside the area, and no feature map reaches there.
-        inside = (at_x > x[0]) & (at_x < x[1]) & (at_z > z[0]) & (at_z < z[1])
-        solid = (labels.dimensions > 0).all(axis=1)
-        cars = np.flatnonzero((labels.type == config.target) & solid & inside)
-        cars = cars[np.argsort(labels.location[cars, 2], kind="stable")]
-        lost = max(0, len(cars) - config.max_objects)
-        cars = cars[: config.max_objects]
-        n_boxes = len(cars)
-        truth[:n_boxes, :3] = labels.location[cars]
-        truth[:n_boxes, 3:6] = labels.dimensions[cars][:, [2, 1, 0]]
-        truth[:n_boxes, 6] = labels.rotation_y[cars]
+        away = frame.labels.bbox[frame.labels.type == DONT_CARE][:MAX_REGIONS]
+        regions[: len(away)] = away
 
     rows, columns = config.image_size
     resized = Image.fromarray(frame.image).resize((columns, rows), Image.Resampling.BILINEAR)
@@ -154,7 +180,9 @@ def make_example(
         image_size=np.array([height, width], np.float32),
         plane=plane.astype(np.float32),
         truth=truth,
-        truth_mask=np.arange(config.max_objects) < n_boxes,
+        truth_mask=(truth[:, 3] > 0) & ~ignored,
+        ignored=ignored,
+        regions=regions,
     )
     counts = {
         "plane_fitted": frame.plane is None,
@@ -215,7 +243,13 @@ def make_inputs(
         image, camera, p2, plane, truth = jax.tree.map(
             lambda a, b: jnp.where(mirror, a, b), flipped, plain
         )
-    truth_mask = jnp.asarray(example.truth_mask)
+    truth_mask, ignored = jnp.asarray(example.truth_mask), jnp.asarray(example.ignored)
+    regions = jnp.asarray(example.regions)
+    if mirror is not None:
+        mirrored = size[1] - 1.0 - regions[:, jnp.array([2, 1, 0, 3])]
+        mirrored = mirrored.at[:, 1::2].set(regions[:, 1::2])
+        mirrored = jnp.where(regions[:, 2:3] > regions[:, :1], mirrored, 0.0)
+        regions = jnp.where(mirror, mirrored, regions)
     if turn is not None:
         camera, p2, plane, truth = turn_and_scale(*turn, camera, p2, plane, truth)
         truth_mask = truth_mask & in_area(config.bev, truth)
@@ -240,5 +274,7 @@ def make_inputs(
         plane=plane,
         truth=truth,
         truth_mask=truth_mask,
+        ignored=ignored,
+        regions=regions,
         told=jnp.zeros(2, jnp.float32) if told is None else told,
     )

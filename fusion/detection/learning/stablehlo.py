@@ -79,6 +79,8 @@ def detect_raw(
         plane=plane,
         truth=none,
         truth_mask=none[:, 0] > 0,
+        ignored=none[:, 0] > 0,
+        regions=none[:1, :4],
     )
     inputs = make_inputs(config, example, image=resize_image(image, config.image_size))
     run = dense_detect if config.is_dense else detect

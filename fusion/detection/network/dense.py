@@ -4,7 +4,7 @@ r"""A one-stage detector on a grid over the ground: camera lifted into it, lidar
 
 The camera's map is read at every cell (`lift`), the lidar's map is brought to the same cells, both
 are scaled by the fusion weights (one half each without a gate) and put side by side. A small
-encoder and decoder over the grid ends in nine numbers a cell: the heat of a car's centre, a box.
+encoder and decoder over the grid ends in eleven numbers a cell: the heat of a car's centre, a box.
 
 Source: Zhou, Wang, Kraehenbuehl (2019), objects as points; Yin, Zhou, Kraehenbuehl (2021),
 CenterPoint; the gate, Shim (2020), section 3.3.2.2. Widths are our choice.
@@ -32,7 +32,8 @@ from fusion.detection.network.views import SameConv
 from fusion.detection.sensors.quality import quality_statistics
 from fusion.targets import init_targets
 
-N_OUTPUTS = 9  # heat; x, z, height from the ground; log length, width, height; cos, sin of heading
+# Heat; x, z, height from the ground; log length, width, height; cos, sin of axis and of heading.
+N_OUTPUTS = 11
 _RARE = -4.0  # log odds of a centre to begin with
 _OUTPUTS = {"fusion": 0.0, "failed": 0.01, "boxes": 0.01}
 
@@ -75,7 +76,7 @@ class _Block(nn.Module):
 
 
 class _Output(nn.Module):
-    """Nine numbers a cell; centres are rare to begin with."""
+    """`N_OUTPUTS` numbers a cell; centres are rare to begin with."""
 
     @nn.compact
     def __call__(self, x: Array) -> Array:
@@ -152,7 +153,7 @@ class DenseDetector(nn.Module):
         failed = self.quality(statistics)
         return Grids(camera, lidar, self.gate(views, statistics, failed), failed)
 
-    def head(self, grids: Grids, scale: Float[Array, "b 2"]) -> Float[Array, "b r s 9"]:
+    def head(self, grids: Grids, scale: Float[Array, "b 2"]) -> Float[Array, "b r s 11"]:
         """Heat (log odds) and box of every cell from the scaled views."""
         factor = scale[:, :, None, None, None]
         x = jnp.concatenate([factor[:, 0] * grids.camera, factor[:, 1] * grids.lidar], axis=-1)
@@ -178,7 +179,7 @@ class DenseAuxiliary(nn.Module):
 
     @nn.compact
     def __call__(self, camera: Array, lidar: Array) -> tuple[Array, Array]:
-        """Outputs of each view `[b, r, s, 9]`."""
+        """Outputs of each view `[b, r, s, 11]`."""
         top = self.config.dense.trunk_widths[0]
         found = []
         for sensor, x in (("camera", camera), ("lidar", lidar)):
@@ -198,7 +199,8 @@ def _shapes(config: DetectorConfig) -> Inputs:
     return Inputs(
         image=of(*config.image_size, 3), bev=of(*config.bev.shape, config.bev.n_slices + 1),
         anchors=none, anchor_mask=none, n_occupied=none, p2=of(3, 4), image_size=of(2),
-        plane=of(4), truth=none, truth_mask=none, told=of(2),
+        plane=of(4), truth=none, truth_mask=none, ignored=none, regions=none,
+        told=of(2),
     )  # fmt: skip
 
 

@@ -17,7 +17,9 @@ class Inputs(NamedTuple):
         n_occupied: anchors of the grid that hold points.
         p2: `[3, 4]` projection; image_size: `[2]` original rows and columns.
         plane: `[4]` ground plane.
-        truth, truth_mask: `[g, 7]` labelled boxes and which rows hold one.
+        truth, truth_mask: `[g, 7]` labelled boxes and which rows hold one of the target class.
+        ignored: `[g]` rows that are neither objects nor background, such as vans for cars.
+        regions: `[d, 4]` DontCare regions in pixels of the original image, zeros for none.
         told: `[2]` severity of the failure of (camera, lidar), 0 while it works; only the gate of
             `dense_oracle` reads it.
     """
@@ -32,4 +34,6 @@ class Inputs(NamedTuple):
     plane: Array
     truth: Array
     truth_mask: Array
+    ignored: Array
+    regions: Array
     told: Array

@@ -40,6 +40,9 @@ VISIBILITY_COLUMNS = (
     "x", "y", "z", "length", "width", "height", "rotation_y",
 )  # fmt: skip
 """Columns of `visibility/*.csv`; boxes as in `label_2`, of look-alikes too."""
+MAX_REPEATS = 20
+"""Frames that may have the same layout: of a hundred with the same five cars, average precision
+tells how well these five are found."""
 
 
 @dataclasses.dataclass(frozen=True, eq=False)
@@ -59,7 +62,8 @@ def split_layouts(
     """Share layouts out in proportion to `counts`, so that no two parts hold the same one.
 
     Raises:
-        ValueError: fewer layouts than parts.
+        ValueError: fewer layouts than parts, or so few that more than `MAX_REPEATS` frames of a
+            part would have the same one.
     """
     wanted = [i for i, n in enumerate(counts) if n]
     if len(layouts) < len(wanted):
@@ -77,6 +81,12 @@ def split_layouts(
         size = 1 + (spare * counts[i]) // total
         stop = len(layouts) if last else start + size
         parts[i] = [layouts[k] for k in order[start:stop]]
+        if counts[i] > MAX_REPEATS * len(parts[i]):
+            raise ValueError(
+                f"{len(layouts)} layouts for {total} frames: {counts[i]} frames of one list would "
+                f"share {len(parts[i])}, expected at most {MAX_REPEATS} a layout; give a folder "
+                "with more label files, fewer frames, or no layouts (a fitted model draws them)"
+            )
         start = stop
     return parts
 

@@ -13,7 +13,12 @@ from fusion.detection.learning.cache import (
 )
 from fusion.detection.learning.checkpoints import Checkpoints
 from fusion.detection.learning.dense_objective import dense_detect, dense_loss, grid_losses
-from fusion.detection.learning.dense_targets import GridTargets, decode_cells, grid_targets
+from fusion.detection.learning.dense_targets import (
+    GridTargets,
+    decode_cells,
+    grid_targets,
+    ignored_cells,
+)
 from fusion.detection.learning.detection_loss import (
     StageLoss,
     balanced_class_loss,
@@ -110,6 +115,7 @@ __all__ = [
     "gate_terms",
     "grid_losses",
     "grid_targets",
+    "ignored_cells",
     "image_scale",
     "in_area",
     "init_training",

@@ -135,7 +135,7 @@ def test_frames_hold_vans_and_regions_which_are_mirrored() -> None:
     labels.type[:] = ["Van", "Car"]
     both = concatenate([labels, select(labels, np.array([0]))])
     both.type[2], both.bbox[2] = "DontCare", (10.0, 6.0, 30.0, 14.0)
-    example, _ = make_example(TINY, dataclasses.replace(frame, labels=both))
+    example, _ = make_example(TINY, frame._replace(labels=both))
     assert example.truth_mask.tolist() == [True, False, False, False]
     assert example.ignored.tolist() == [False, True, False, False]
     np.testing.assert_allclose(example.truth[:2, 0], [3.4, -2.4], rtol=1e-6)

@@ -16,6 +16,7 @@ from fusion.detection.kitti.objects import concatenate, select
 from fusion.detection.learning.dense_objective import grid_losses
 from fusion.detection.learning.dense_targets import (
     GridTargets,
+    average_cells,
     decode_cells,
     grid_targets,
     ignored_cells,
@@ -107,6 +108,19 @@ def test_an_axis_is_told_apart_from_its_direction() -> None:
     for towards, heading in ((1e-3, 1.2), (-1e-3, 1.2 - np.pi)):
         found = decode_cells(TINY, unsure + towards * told[0], PLANE)[cell]
         np.testing.assert_allclose(found[6], heading, atol=1e-3)
+
+
+def test_boxes_are_means_over_the_cells_around_a_peak() -> None:
+    truth = jnp.array([[-2.4, 1.5, 9.4, 4.2, 1.7, 1.5, 1.2]])
+    row, column = int((20 - 9.4) / 0.5), int((8 - 2.4) / 0.5)
+    told = grid_targets(TINY, _inputs(truth, jnp.ones(1, bool))).boxes
+    heat = jnp.full((32, 32, 1), -9.0).at[row, column].set(3.0).at[row, column + 1].set(3.0)
+    error = jnp.zeros_like(told).at[row, column, 0].set(0.6)  # this cell is 0.6 m wrong in x
+    mean = jax.jit(partial(average_cells, TINY))(jnp.concatenate([heat, told + error], axis=-1))
+    np.testing.assert_array_equal(mean[..., :1], heat)
+    found = decode_cells(TINY, mean[..., 1:], PLANE)[row * 32 + column]
+    # Two cells count, and the other one is right.
+    np.testing.assert_allclose(found, truth[0].at[0].add(0.3), atol=2e-3)
 
 
 def test_vans_and_regions_that_nobody_labelled_are_neither_cars_nor_background() -> None:

@@ -15,6 +15,7 @@ from fusion.detection.learning.checkpoints import Checkpoints
 from fusion.detection.learning.dense_objective import dense_detect, dense_loss, grid_losses
 from fusion.detection.learning.dense_targets import (
     GridTargets,
+    average_cells,
     decode_cells,
     grid_targets,
     ignored_cells,
@@ -93,6 +94,7 @@ __all__ = [
     "Sample",
     "StageLoss",
     "assign",
+    "average_cells",
     "balanced_class_loss",
     "class_loss",
     "class_losses",

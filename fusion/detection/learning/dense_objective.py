@@ -24,7 +24,12 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import ground_box
 from fusion.detection.geometry.suppression import nms
-from fusion.detection.learning.dense_targets import GridTargets, decode_cells, grid_targets
+from fusion.detection.learning.dense_targets import (
+    GridTargets,
+    average_cells,
+    decode_cells,
+    grid_targets,
+)
 from fusion.detection.learning.gate_objective import PathLosses, failure_loss, gate_terms
 from fusion.detection.learning.objective import DetectorLoss
 from fusion.detection.learning.params import DetectorParams
@@ -111,6 +116,8 @@ def dense_loss(
 def dense_detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Detections:
     """Detections of a batch of frames, inside jit: peaks of the heat, rotated suppression.
 
+    A peak's box is the mean of what the cells around it tell (`average_cells`).
+
     Arguments are those of `detect`.
     """
     model: Any = DenseDetector(config)
@@ -122,7 +129,8 @@ def dense_detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) 
         around = jax.lax.reduce_window(heat, -jnp.inf, jax.lax.max, (3, 3), (1, 1), "SAME")
         score = jnp.where(heat >= around, heat, 0.0).ravel()
         top, index = jax.lax.top_k(score, min(config.dense.candidates, score.shape[0]))
-        boxes = decode_cells(config, output[..., 1:], plane)[index]
+        told = average_cells(config, output)[..., 1:]
+        boxes = decode_cells(config, told, plane)[index]
         sound = jnp.isfinite(boxes).all(axis=1) & (top >= config.score_threshold) & (top > 0)
         kept, found = nms(
             ground_box(boxes),

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 from typing import NamedTuple
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
@@ -118,6 +119,32 @@ def grid_targets(config: DetectorConfig, inputs: Inputs) -> GridTargets:
     near = near | centre
     ignored = ignored_cells(config, inputs) & ~near
     return GridTargets(jnp.where(centre, 1.0, heat), centre, near, boxes, ignored)
+
+
+def average_cells(
+    config: DetectorConfig, outputs: Float[Array, "r s 11"]
+) -> Float[Array, "r s 11"]:
+    r"""Outputs whose boxes are means over the cells around, weighed by their heat, inside jit.
+
+    .. math:: \bar t_i = \sum_{j \in N(i)} y_j t_j \Big/ \sum_{j \in N(i)} y_j
+
+    Every cell within `DenseConfig.radius` of a car learns to tell its box, with errors of its own:
+    the mean over the 3 x 3 cells of a peak is steadier than the peak's own box. Places are
+    averaged, not distances from each cell.
+
+    Args:
+        config: static.
+        outputs: of the network; the heat stays as it is.
+    """
+    at = jnp.stack([jnp.asarray(a) for a in grid_centres(config)], axis=-1)
+    heat = jax.nn.sigmoid(outputs[..., :1])
+    told = outputs[..., 1:].at[..., :2].add(at)
+    sums = [
+        jax.lax.reduce_window(a, 0.0, jax.lax.add, (3, 3, 1), (1, 1, 1), "SAME")
+        for a in (heat * told, heat)
+    ]
+    mean = (sums[0] / jnp.maximum(sums[1], 1e-9)).at[..., :2].add(-at)
+    return jnp.concatenate([outputs[..., :1], mean], axis=-1)
 
 
 def decode_cells(

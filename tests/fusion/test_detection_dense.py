@@ -186,6 +186,12 @@ def test_the_gate_adds_less_than_two_percent() -> None:
         assert plain < gated < 1.02 * plain and plain < oracle < 1.02 * plain
 
 
+def test_few_training_frames_lack_a_view() -> None:
+    for model in ("dense", "dense_argate", "dense_oracle"):
+        assert preset("small", model).config.path_drop == 0.1
+    assert preset("small", "avod").config.path_drop == 0.3
+
+
 @pytest.mark.slow
 def test_only_the_oracle_is_told() -> None:
     example, _ = make_example(TINY, a_frame())

@@ -1,8 +1,9 @@
-"""Line sampling by values alone, its direction from a Gaussian process of all evaluations."""
+"""Line sampling by values alone, its direction from a plane and a Gaussian process of the rest."""
 
 from __future__ import annotations
 
 import math
+from typing import NamedTuple
 
 import jax
 import numpy as np
@@ -16,14 +17,52 @@ from failure.models.emulator import Emulator
 from failure.performances import Counted, Performance
 
 
+class Plane(NamedTuple):
+    """A tangent plane of a performance function: its value and gradient at a point."""
+
+    point: Float[np.ndarray, " D"]
+    value: float
+    gradient: Float[np.ndarray, " D"]
+
+    def predict(self, x: Float[np.ndarray, "n D"]) -> Float[np.ndarray, " n"]:
+        """Values of the plane."""
+        return self.value + (x - self.point) @ self.gradient
+
+
+class BentPlane:
+    """A plane and a Gaussian process of what it leaves.
+
+    A process alone takes sixty differences along the axes for a curved function with sixty unknown
+    lengthscales, and its gradient at the threshold lies 30 degrees off where the differences' own
+    lies one and a half off.
+
+    Args:
+        plane: what the differences say.
+        x, y: everything simulated.
+    """
+
+    def __init__(
+        self, plane: Plane, x: Float[np.ndarray, "n D"], y: Float[np.ndarray, " n"]
+    ) -> None:
+        self._plane, self._rest = plane, Emulator(x, y - plane.predict(x))
+
+    def predict(self, x: Float[np.ndarray, "m D"]) -> Float[np.ndarray, " m"]:
+        """Expected values."""
+        return self._plane.predict(x) + self._rest.predict(x)[0]
+
+    def slope(self, x: Float[np.ndarray, "m D"]) -> Float[np.ndarray, "m D"]:
+        """Gradients of the expected values."""
+        return self._plane.gradient[None] + self._rest.slope(x)
+
+
 def emulated_point(
-    emulator: Emulator, threshold: float, start: Float[np.ndarray, " D"], *, steps: int = 20
+    emulator: BentPlane, threshold: float, start: Float[np.ndarray, " D"], *, steps: int = 20
 ) -> tuple[Float[np.ndarray, " D"], Float[np.ndarray, " D"]]:
     """The emulator's own design point and its gradient there; costs no simulation."""
     u = np.array(start, np.float64)
     g = np.zeros_like(u)
     for _ in range(steps):
-        mean, _ = emulator.predict(u[None])
+        mean = emulator.predict(u[None])
         g = emulator.slope(u[None])[0]
         target = ((g @ u - (float(mean[0]) - threshold)) / max(float(g @ g), 1e-300)) * g
         move = target - u
@@ -48,9 +87,10 @@ def guided_lines(
 ) -> tuple[Estimate, Float[np.ndarray, " D"], float]:
     r"""Probability of the region that slopes lead to, without a second round of differences.
 
-    Forward differences at nominal, steps to the threshold with Broyden's update, then lines. A
-    Gaussian process of everything evaluated gives their direction, and is fitted again after each
-    batch, so that the lines themselves turn it. Each line stands for itself,
+    Forward differences at nominal, steps to the threshold with Broyden's update, then lines. Their
+    direction comes from the plane that the steps end with and a Gaussian process of what it leaves
+    of everything evaluated, fitted again after each batch, so that the lines themselves turn it.
+    Each line stands for itself,
 
     .. math:: \hat p = \frac1m \sum_i \Phi(-t_i), \qquad y(v_i + t_i a_i) = T, \quad
         v_i \perp a_i
@@ -95,13 +135,14 @@ def guided_lines(
     if abs(y - threshold) > 0.5 * descent.scale():
         why = f"the threshold is not reached within {np.linalg.norm(u):.1f} sigma"
         return _unknown(counted, why), u, descent.first
+    plane = Plane(u, y, g)
     with jax.enable_x64(True):
         draws = np.asarray(jax.random.normal(key, (most, dim)))
     distances: list[float] = []
     backwards, mean = 0, math.nan
     lower, upper, effective, narrow = 0.0, 1.0, 0.0, False
     while counted.n_values + 3 * batch <= most and not narrow:
-        emulator = Emulator(*counted.samples())
+        emulator = BentPlane(plane, *counted.samples())
         point, slope = emulated_point(emulator, threshold, u)
         if np.linalg.norm(point) < 1.5 * np.linalg.norm(u) + LONGEST and np.any(slope):
             u, g = point, slope

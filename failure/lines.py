@@ -151,6 +151,8 @@ def interval_of_lines(t: np.ndarray) -> tuple[float, float, float, float]:
     if mean > 0.0:
         lower = mean * (lower / mean) ** STOPPING
         upper = min(1.0, mean * (upper / mean) ** STOPPING)
+    # One step per line leaves a rest that the spread of the lines does not show.
+    lower, upper = min(lower, mean / 1.01), max(upper, min(1.0, mean * 1.01))
     return mean, lower, upper, effective
 
 
@@ -178,8 +180,6 @@ def _judge(
             f"after {lines} lines the interval is still wider than a factor {factor:g}; the "
             "boundary bends or has several regions: use subset_simulation beside it"
         )
-    # One step per line leaves a rest that the spread of the lines does not show.
-    lower, upper = min(lower, mean / 1.01), max(upper, min(1.0, mean * 1.01))
     if 0.0 < bend <= BEND:
         # Where the boundary bends, rare lines carry much and are missed at first: room for what
         # the second-order formula says (Breitung 1984).

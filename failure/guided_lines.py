@@ -85,12 +85,13 @@ def guided_lines(
     min_lines: int = 10,
     most: int = 400,
 ) -> tuple[Estimate, Float[np.ndarray, " D"], float]:
-    r"""Probability of the region that slopes lead to, without a second round of differences.
+    r"""Probability of the region that slopes lead to; a second round of differences only at need.
 
     Forward differences at nominal, steps to the threshold with Broyden's update, then lines. Their
     direction comes from the plane that the steps end with and a Gaussian process of what it leaves
     of everything evaluated, fitted again after each batch, so that the lines themselves turn it.
-    Each line stands for itself,
+    Where the first lines (1.6 `min_lines`) disagree, differences are taken once more, where the
+    steps ended, and lines begin anew, along these. Each line stands for itself,
 
     .. math:: \hat p = \frac1m \sum_i \Phi(-t_i), \qquad y(v_i + t_i a_i) = T, \quad
         v_i \perp a_i
@@ -139,13 +140,14 @@ def guided_lines(
     with jax.enable_x64(True):
         draws = np.asarray(jax.random.normal(key, (most, dim)))
     distances: list[float] = []
-    backwards, mean = 0, math.nan
+    backwards, again, mean = 0, False, math.nan
     lower, upper, effective, narrow = 0.0, 1.0, 0.0, False
     while counted.n_values + 3 * batch <= most and not narrow:
-        emulator = BentPlane(plane, *counted.samples())
-        point, slope = emulated_point(emulator, threshold, u)
-        if np.linalg.norm(point) < 1.5 * np.linalg.norm(u) + LONGEST and np.any(slope):
-            u, g = point, slope
+        if not again:
+            emulator = BentPlane(plane, *counted.samples())
+            point, slope = emulated_point(emulator, threshold, u)
+            if np.linalg.norm(point) < 1.5 * np.linalg.norm(u) + LONGEST and np.any(slope):
+                u, g = point, slope
         rate = float(np.linalg.norm(g))
         axis = g / rate
         rows = draws[len(distances) : len(distances) + batch]
@@ -157,6 +159,12 @@ def guided_lines(
         if len(good) >= min_lines:
             mean, lower, upper, effective = interval_of_lines(good)
             narrow = mean > 0.0 and upper <= factor * mean and lower >= mean / factor
+            room = counted.n_values + dim + 4 * batch <= most
+            if not narrow and not again and len(good) >= 1.6 * min_lines and room:
+                # The gradient has turned on the way: differences where the steps ended.
+                again, distances, backwards = True, [], 0
+                u, y, g = by_values(descent, plane.point, *descent.both(plane.point), 6)
+                plane = Plane(u, y, g)
     lines, valid = len(distances), int(np.isfinite(distances).sum())
     reasons = []
     if not narrow:

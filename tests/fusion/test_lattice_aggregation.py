@@ -130,7 +130,7 @@ def test_means_of_rows_that_are_nowhere() -> None:
 
 
 @pytest.mark.relaxed  # flax and optax promote types
-@pytest.mark.parametrize("dtype", [jnp.float32, jnp.bfloat16])
+@pytest.mark.parametrize("dtype", [jnp.float32, pytest.param(jnp.bfloat16, marks=pytest.mark.slow)])
 def test_no_violation_after_large_steps(dtype: Any, items: list[np.ndarray]) -> None:
     model = linen.Aggregation(CONFIG, param_dtype=dtype)
     x, mask = padded(items)
@@ -153,6 +153,7 @@ def test_no_violation_after_large_steps(dtype: Any, items: list[np.ndarray]) -> 
     assert np.asarray(run(params)).max() == 0.0
 
 
+@pytest.mark.slow
 @pytest.mark.relaxed
 def test_modules_equal_the_functions(items: list[np.ndarray]) -> None:
     x, mask = padded(items)

@@ -162,8 +162,8 @@ RULES = (
     ),
     Rule(
         "study_robustness.py",
-        "--size tiny --seeds 1 --steps 1 --models dense --kinds camera_blackout lidar_loss "
-        "--levels 5 --any-size --results runs",
+        "--data runs/kitti --size tiny --seeds 1 --steps 1 --models dense "
+        "--kinds camera_blackout lidar_loss --levels 5 --any-size --results runs",
     ),
     Rule(
         "study_views.py",

@@ -163,8 +163,7 @@ def guided_lines(
             if not narrow and not again and len(good) >= 1.6 * min_lines and room:
                 # The gradient has turned on the way: differences where the steps ended.
                 again, distances, backwards = True, [], 0
-                u, y, g = by_values(descent, plane.point, *descent.both(plane.point), 6)
-                plane = Plane(u, y, g)
+                u, _, g = by_values(descent, plane.point, *descent.both(plane.point), 6)
     lines, valid = len(distances), int(np.isfinite(distances).sum())
     reasons = []
     if not narrow:

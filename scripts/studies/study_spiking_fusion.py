@@ -21,7 +21,13 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import Compared, column_cells, record_table, recorded
+from snn_fusion_failure.records.rows import (
+    Compared,
+    column_cells,
+    record_table,
+    recorded,
+    values_by_seed,
+)
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     print_result,
@@ -220,9 +226,7 @@ def failing_means(rows: list[dict[str, Any]]) -> list[dict[str, Any]]:
     held: dict[str, dict[str, dict[int, float]]] = {}
     for cell in rows:
         if cell["metric"] == "accuracy" and cell["row"] in FAILING:
-            seeds = cell.get("seeds", range(cell["n"]))
-            by_seed = dict(zip(seeds, cell["values"], strict=True))
-            held.setdefault(cell["model"], {})[cell["row"]] = by_seed
+            held.setdefault(cell["model"], {})[cell["row"]] = values_by_seed(cell)
     found = []
     for model, by_row in held.items():
         common = sorted(set.intersection(*(set(by_row.get(row, {})) for row in FAILING)))

@@ -52,13 +52,19 @@ def column_cells(
     return cells
 
 
+def values_by_seed(cell: Mapping[str, Any]) -> dict[int, float]:
+    """Seed -> value of a row of record; a row without `seeds` has those from 0 on."""
+    values = cell.get("values", ())
+    return dict(zip(cell.get("seeds", range(len(values))), values, strict=True))
+
+
 def compare_columns(
     rows: Iterable[Mapping[str, Any]], compared: Iterable[Compared]
 ) -> list[dict[str, Any]]:
     """Differences between columns seed by seed, with Holm's correction over all of them.
 
     Args:
-        rows: of a table of record; a row without `seeds` has those from 0 on.
+        rows: of a table of record.
         compared: what is compared; the first one's cases have the rows' names, those of others
             name the metric too. Pairs of fewer than two common seeds are left out.
     """
@@ -66,9 +72,7 @@ def compare_columns(
 
     held: dict[str, dict[tuple[str, str], dict[int, float]]] = {}
     for cell in rows:
-        values = cell.get("values", ())
-        by_seed = dict(zip(cell.get("seeds", range(len(values))), values, strict=True))
-        held.setdefault(cell["metric"], {})[cell["row"], cell["model"]] = by_seed
+        held.setdefault(cell["metric"], {})[cell["row"], cell["model"]] = values_by_seed(cell)
     found = []
     for place, (metric, pairs, factor) in enumerate(compared):
         columns = held.get(metric, {})

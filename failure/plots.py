@@ -1,4 +1,4 @@
-"""Pictures of a search: worst case against simulations, and which parameters were active.
+"""Pictures: worst case against simulations, active parameters, errors of a probability.
 
 Each returns a figure; `figure.savefig(path)` is the caller's.
 """
@@ -9,6 +9,7 @@ from collections.abc import Mapping, Sequence
 
 import numpy as np
 from matplotlib.figure import Figure
+from matplotlib.lines import Line2D
 
 from failure.search.bayesopt import best_so_far
 
@@ -85,4 +86,79 @@ def plot_shares(shares: Mapping[str, float], *, title: str) -> Figure:
     axes.tick_params(axis="x", rotation=90, labelsize=7)
     axes.set_ylabel("mean fusion weight")
     axes.set_title(title, fontsize=9)
+    return figure
+
+
+def plot_errors(
+    runs: Mapping[str, Mapping[str, tuple[np.ndarray, np.ndarray, np.ndarray]]],
+) -> Figure:
+    """Estimated over true probability against simulations, one panel per problem, a mark per run.
+
+    Filled marks are runs that call themselves good, hollow ones say that they do not know; the band
+    is a factor 2. Ratios outside of the panel are drawn on its edge.
+
+    Args:
+        runs: problem -> method -> (simulations `[S]`, estimate over truth `[S]`, good `[S]`).
+    """
+    across = min(3, len(runs))
+    down = -(-len(runs) // across)
+    figure = Figure(figsize=(3.3 * across + 1.8, 2.7 * down + 0.4), layout="constrained", dpi=150)
+    panels = figure.subplots(down, across, squeeze=False, sharey=True).flat
+    methods = list(dict.fromkeys(m for found in runs.values() for m in found))
+    low, high = 0.05, 20.0
+    for axes, (title, found) in zip(panels, runs.items(), strict=False):
+        axes.axhspan(0.5, 2.0, color="0.92", zorder=0)
+        axes.axhline(1.0, color="0.6", linewidth=0.8, zorder=1)
+        for method, (simulations, ratio, good) in found.items():
+            color = f"C{methods.index(method) % 10}"
+            held = np.clip(np.nan_to_num(ratio, nan=low), low, high)
+            for known in (True, False):
+                rows = good == known
+                axes.scatter(
+                    simulations[rows], held[rows], s=14, linewidths=0.8, edgecolors=color,
+                    facecolors=color if known else "none", zorder=2,
+                )  # fmt: skip
+        axes.set_xscale("log")
+        axes.set_yscale("log")
+        axes.set_ylim(0.9 * low, 1.1 * high)
+        axes.set_title(title, fontsize=8)
+        axes.tick_params(labelsize=7)
+        axes.set_xlabel("simulations", fontsize=7)
+    for axes in list(panels):
+        axes.set_visible(False)
+    figure.supylabel("estimate / P", fontsize=8)
+    marks = [
+        Line2D([], [], marker="o", linestyle="", markersize=4, color=f"C{k % 10}", label=name)
+        for k, name in enumerate(methods)
+    ]
+    figure.legend(handles=marks, loc="outside right upper", fontsize=7)
+    return figure
+
+
+def plot_design_points(
+    names: Sequence[tuple[str, str]], points: Mapping[str, np.ndarray], *, title: str
+) -> Figure:
+    r"""Which transistors a failure is made of: share of each in the squared distance.
+
+    .. math:: s_t = \sum_{i \in t} u_i^2 / |u|^2
+
+    Args:
+        names: `(transistor, quantity)` of every parameter.
+        points: specification -> nearest failing point `[D]` [sigma].
+        title: of the picture.
+    """
+    transistors = list(dict.fromkeys(name for name, _ in names))
+    figure = Figure(figsize=(0.34 * len(transistors) + 2.0, 3.2), layout="constrained", dpi=150)
+    axes = figure.add_subplot()
+    width = 0.8 / len(points)
+    for k, (label, point) in enumerate(points.items()):
+        share = np.zeros(len(transistors))
+        for (name, _), value in zip(names, point, strict=True):
+            share[transistors.index(name)] += value**2 / float(point @ point)
+        at = np.arange(len(transistors)) + (k - 0.5 * (len(points) - 1)) * width
+        axes.bar(at, share, width, label=f"{label}, {np.linalg.norm(point):.2f} sigma")
+    axes.set_xticks(range(len(transistors)), transistors, rotation=90, fontsize=7)
+    axes.set_ylabel("share of the squared distance", fontsize=8)
+    axes.set_title(title, fontsize=9)
+    axes.legend(fontsize=7)
     return figure

@@ -5,7 +5,8 @@
 Parameters are standard normal in units of sigma. Problems whose probability is known exactly
 (`failure.problems`) and, with `--specs`, specifications of the circuits at thresholds of a fixed
 probability, which are measured first: long line sampling moves the threshold until the probability
-is the wanted one, and importance sampling from the same point checks it.
+is the wanted one, and importance sampling from the same point checks it. `--netlists` are circuits
+that only ngspice knows (`examples/`); they have no gradients.
 
 Methods: `lines` (design point, then line sampling), `guided_lines` (values only, direction from a
 Gaussian process), `regions` (all regions that can be found, each by lines), `ak_is` (importance
@@ -16,7 +17,8 @@ ball of 1.1 design distances. A row of record holds simulations to the first fai
 runs that end within a factor 2 of the truth with a verdict "good" (`success_rate`; of searches the
 share that finds a failure), what they cost, the share of all intervals that hold the truth
 (`coverage`), and the cosine between the design point that was found and a true one. Every cell is
-kept in `--out`, so the command can be killed and repeated. Writes `results/table_4_sigma.json`.
+kept in `--out`, so the command can be killed and repeated. Writes `results/table_4_sigma.json`; with
+`--pictures FOLDER` errors of all runs against their cost, and design points by transistor.
 """
 
 from __future__ import annotations
@@ -28,6 +30,8 @@ from typing import Any
 
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.records.sigma_cases import SPECS, Case, cached, circuit_case, problem_case
+from snn_fusion_failure.records.sigma_netlists import NETLISTS, netlist_case
+from snn_fusion_failure.records.sigma_pictures import Cell, draw_design_points, draw_errors
 from snn_fusion_failure.records.sigma_searches import (
     SEARCHES,
     monte_carlo_rows,
@@ -53,6 +57,8 @@ class Config:
     """Problems of known probability."""
     specs: tuple[str, ...] = ()
     """Specifications: iq, undershoot, load_regulation, overshoot, output_accuracy."""
+    netlists: tuple[str, ...] = ()
+    """Netlists: memory_cell, opamp_settling, opamp_offset."""
     probabilities: tuple[float, ...] = (1e-6, 1e-9)
     """Failure probabilities."""
     dim: int = 60
@@ -74,6 +80,8 @@ class Config:
     """Folder of the cells."""
     record: Path = repository.RESULTS / "table_4_sigma.json"
     """Table of record."""
+    pictures: Path | None = None
+    """Folder for pictures of the rows and methods of this command."""
 
 
 def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
@@ -192,11 +200,19 @@ def main(config: Config) -> dict[str, Any]:
     for name in config.searches:
         if name not in SEARCHES:
             raise ValueError(f"searches={name!r}: expected some of {', '.join(SEARCHES)}")
+    for name in config.netlists:
+        if name not in NETLISTS:
+            raise ValueError(f"netlists={name!r}: expected some of {', '.join(NETLISTS)}")
+        slow = [m for m in (*config.methods, *config.searches) if m.endswith("+gradient")]
+        if slow:
+            raise ValueError(f"methods={slow[0]!r}: a netlist has no gradients; leave it out")
     if config.seeds < 1:
         raise ValueError(f"seeds={config.seeds}: expected at least 1")
     enable_compilation_cache()
-    names = [*config.specs, *config.problems]
+    names = [*config.specs, *config.netlists, *config.problems]
     rows: list[dict[str, Any]] = []
+    cells: list[Cell] = []
+    cases: list[Case] = []
     with progress() as bar:
         total = len(names) * len(config.probabilities) * len(config.methods)
         job = bar.add_task("sigma", total=total, status="")
@@ -204,8 +220,11 @@ def main(config: Config) -> dict[str, Any]:
             for p in config.probabilities:
                 if name in SPECS:
                     case = circuit_case(name, p, config.out)
+                elif name in NETLISTS:
+                    case = netlist_case(name, p, config.out)
                 else:
                     case = problem_case(name, p, config.dim)
+                cases.append(case)
                 rows += other_rows(config, case)
                 for method in config.methods:
                     bar.update(job, status=f"{case.row} {method}")
@@ -214,11 +233,15 @@ def main(config: Config) -> dict[str, Any]:
                         cached(folder / f"{seed}.json", lambda s=seed: one_run(case, method, s))  # type: ignore[misc]  # noqa: B023
                         for seed in range(config.seeds)
                     ]
+                    cells.append(Cell(case, method, runs))
                     new = rows_of(case, method, runs)
                     rows += new
                     title = "Failures at fixed probability"
                     record_table(config.record, "4.sigma", title, new, preset="paper")
                     bar.advance(job)
+    if config.pictures is not None:
+        draw_errors(cells, config.pictures / "table_4_sigma.png")
+        draw_design_points(cases, config.pictures)
     return {"rows": rows}
 
 

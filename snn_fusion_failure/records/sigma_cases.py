@@ -18,6 +18,9 @@ SPECS = {
 }
 """Name in the table -> circuit and specification."""
 
+USUAL_DIM = 60
+"""Parameters of a problem whose row does not name their number."""
+
 LINES = 400
 """Lines behind the probability at a measured threshold."""
 
@@ -27,7 +30,7 @@ class Case(NamedTuple):
 
     row: str
     performance: Callable[[Any], Any]
-    slopes: Callable[[Any], Any]
+    slopes: Callable[[Any], Any] | None
     threshold: float
     dim: int
     truth: float
@@ -45,8 +48,9 @@ def problem_case(name: str, p: float, dim: int) -> Case:
     problem = make_problem(name, p, dim)
     with jax.enable_x64(True):
         program = jax.jit(problem.performance)
+    size = "" if dim == USUAL_DIM else f" D={dim}"
     return Case(
-        f"{name} P={p:.0e}", program, slopes_by_jax(problem.performance), problem.threshold,
+        f"{name}{size} P={p:.0e}", program, slopes_by_jax(problem.performance), problem.threshold,
         dim, problem.probability, problem.points, problem.performance,
     )  # fmt: skip
 

@@ -56,7 +56,7 @@ def monte_carlo_rows(row: str, truth: float, threshold: float) -> list[dict[str,
 def search_runs(
     name: str,
     performance: Callable[[Any], Any],
-    slopes: Callable[[Any], Any],
+    slopes: Callable[[Any], Any] | None,
     threshold: float,
     points: np.ndarray,
     *,
@@ -68,7 +68,7 @@ def search_runs(
     Args:
         name: key of `SEARCHES`.
         performance: `x [n, D] -> y [n]`.
-        slopes: `x [n, D] -> (y [n], dy/dx [n, D])`.
+        slopes: `x [n, D] -> (y [n], dy/dx [n, D])`, which searches with gradients need.
         threshold: failure is above it.
         points: `[k, D]`, true design points.
         seeds: searches.
@@ -83,6 +83,8 @@ def search_runs(
     from failure.search.task import Task
 
     setting = SEARCHES[name]
+    if setting.gradient and slopes is None:
+        raise ValueError(f"name={name!r}: expected slopes, the search uses gradients")
     dim = points.shape[1]
     radius = REACH * float(np.linalg.norm(points, axis=1).min())
     retrain = 5 if setting.method == "active_subspace" else None
@@ -91,7 +93,7 @@ def search_runs(
         n_init=setting.n_init, n_total=most, retrain_every=retrain,
     )  # fmt: skip
     train = None
-    if setting.gradient:
+    if setting.gradient and slopes is not None:
         train = subspace_of_gradient(lambda x: np.nan_to_num(np.asarray(slopes(x)[1])))
     state = bayesopt.init(config)
     with jax.enable_x64(True):

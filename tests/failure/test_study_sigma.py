@@ -1,5 +1,11 @@
-"""The study of fixed probabilities: one cell, resumed without a further run."""
+"""The study of fixed probabilities: one cell, resumed without a further run; netlists; pictures."""
 
+import numpy as np
+import pytest
+
+from failure.circuits.solver import ngspice
+from failure.problems import make_problem
+from snn_fusion_failure.records import sigma_netlists
 from tests._scripts import load_script
 
 
@@ -7,14 +13,45 @@ def test_a_cell_is_measured_once_and_recorded(tmp_path):
     study = load_script("studies/study_sigma")
     config = study.Config(
         problems=("linear",), probabilities=(1e-6,), methods=("lines", "lines+gradient"), seeds=2,
-        dim=12, out=tmp_path / "cells", record=tmp_path / "table.json",
+        dim=12, out=tmp_path / "cells", record=tmp_path / "table.json", pictures=tmp_path,
     )  # fmt: skip
     rows = study.main(config)["rows"]
     by = {(r["model"], r["metric"]): r["mean"] for r in rows}
+    assert {r["row"] for r in rows} == {"linear D=12 P=1e-06"}
     assert by["lines+gradient", "success_rate"] == by["lines", "coverage"] == 1.0
     assert by["lines+gradient", "sims_factor2"] <= 20 < by["lines", "sims_factor2"] <= 60
     assert by["lines+gradient", "design_point_cosine"] > 0.999
-    assert (tmp_path / "table.json").exists()
+    assert (tmp_path / "table.json").exists() and (tmp_path / "table_4_sigma.png").exists()
     stamps = {p: p.stat().st_mtime_ns for p in (tmp_path / "cells").rglob("*.json")}
     assert study.main(config)["rows"][0]["mean"] == rows[0]["mean"]
     assert {p: p.stat().st_mtime_ns for p in stamps} == stamps
+
+
+def test_a_netlist_with_gradients_is_refused(tmp_path):
+    study = load_script("studies/study_sigma")
+    config = study.Config(problems=(), netlists=("memory_cell",), methods=("lines+gradient",))
+    with pytest.raises(ValueError, match="a netlist has no gradients"):
+        study.main(config)
+
+
+def test_the_threshold_of_a_worst_of_two_holds_both_regions():
+    """Two sides of a window, from their terms alone, against the closed form."""
+    exact = make_problem("window", 1e-6, 12)
+    axis = exact.points[0] / np.linalg.norm(exact.points[0])
+    terms = [lambda x: np.asarray(x) @ axis, lambda x: -(np.asarray(x) @ axis)]
+    found = sigma_netlists.measured_threshold(
+        terms, lambda x: np.abs(np.asarray(x) @ axis), 12, 1e-6
+    )
+    assert found["threshold"] == pytest.approx(exact.threshold, abs=0.01)
+    assert found["probability"] == pytest.approx(1e-6, rel=0.05)
+    low, high = found["check_interval"]
+    assert low < 1e-6 < high and found["verdict"] == "good"
+
+
+@pytest.mark.skipif(not ngspice.available(), reason="ngspice is not installed")
+def test_both_halves_of_the_memory_cell_are_the_same_circuit_mirrored():
+    outputs = sigma_netlists.outputs_of(sigma_netlists.NETLISTS["memory_cell"])
+    x = np.random.default_rng(0).normal(size=6)
+    y = outputs(np.stack([x, np.roll(x, 3)]))
+    assert np.all((y < -100.0) & (y > -250.0))
+    np.testing.assert_allclose(y[0], y[1, ::-1], atol=0.5)

@@ -95,11 +95,15 @@ def first_hit(y: np.ndarray, threshold: float) -> np.ndarray:
     Example:
         >>> first_hit(np.array([[0.0, 2.0, 3.0], [0.0, 0.0, 1.0]]), 1.5).tolist()
         [2.0, nan]
+        >>> first_hit(np.empty((2, 0)), 1.5).tolist()  # nothing simulated yet
+        [nan, nan]
     """
     if np.isnan(threshold):
         raise ValueError(f"threshold={threshold}: expected a number")
-    failed = y > threshold
-    return np.where(failed.any(1), failed.argmax(1) + 1.0, np.nan)
+    # A column behind all, which always counts: there may be no simulation yet.
+    failed = np.concatenate([y > threshold, np.ones((len(y), 1), bool)], axis=1)
+    first = failed.argmax(1)
+    return np.where(first < y.shape[1], first + 1.0, np.nan)
 
 
 def seed_keys(config: SearchConfig, n: int) -> Any:

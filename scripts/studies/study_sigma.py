@@ -17,8 +17,8 @@ ball of 1.1 design distances. A row of record holds simulations to the first fai
 runs that end within a factor 2 of the truth with a verdict "good" (`success_rate`; of searches the
 share that finds a failure), what they cost, the share of all intervals that hold the truth
 (`coverage`), and the cosine between the design point that was found and a true one. Every cell is
-kept in `--out`, so the command can be killed and repeated. Writes `results/table_4_sigma.json`; with
-`--pictures FOLDER` errors of all runs against their cost, and design points by transistor.
+kept in `--out`, so the command can be killed and repeated. Writes `results/table_4_sigma.json`;
+with `--pictures FOLDER` errors of all runs against their cost, and design points by transistor.
 """
 
 from __future__ import annotations
@@ -208,13 +208,16 @@ def main(config: Config) -> dict[str, Any]:
             raise ValueError(f"methods={slow[0]!r}: a netlist has no gradients; leave it out")
     if config.seeds < 1:
         raise ValueError(f"seeds={config.seeds}: expected at least 1")
+    if not config.methods and not config.searches:
+        raise ValueError("methods and searches are empty: expected at least one of either")
     enable_compilation_cache()
     names = [*config.specs, *config.netlists, *config.problems]
     rows: list[dict[str, Any]] = []
     cells: list[Cell] = []
     cases: list[Case] = []
     with progress() as bar:
-        total = len(names) * len(config.probabilities) * len(config.methods)
+        parts = len(config.methods) + len(config.searches)
+        total = len(names) * len(config.probabilities) * parts
         job = bar.add_task("sigma", total=total, status="")
         for name in names:
             for p in config.probabilities:
@@ -225,7 +228,9 @@ def main(config: Config) -> dict[str, Any]:
                 else:
                     case = problem_case(name, p, config.dim)
                 cases.append(case)
+                bar.update(job, status=case.row)
                 rows += other_rows(config, case)
+                bar.advance(job, len(config.searches))
                 for method in config.methods:
                     bar.update(job, status=f"{case.row} {method}")
                     folder = config.out / case.row.replace(" ", "_") / method
@@ -263,14 +268,17 @@ def other_rows(config: Config, case: Case) -> list[dict[str, Any]]:
 
 
 def result(found: dict[str, Any]) -> dict[str, Any]:
-    """The result line: least coverage and mean success over the cells."""
-    by = {m: [r["mean"] for r in found["rows"] if r["metric"] == m] for m in ("coverage",)}
-    good = [r["mean"] for r in found["rows"] if r["metric"] == "success_rate"]
-    return {
-        "rows": len(found["rows"]),
-        "least_coverage": min(by["coverage"]),
-        "mean_success": sum(good) / len(good),
-    }
+    """The result line: least coverage and mean success over the cells of the methods."""
+    covered = [r for r in found["rows"] if r["metric"] == "coverage"]
+    methods = {r["model"] for r in covered}
+    good = [
+        r["mean"] for r in found["rows"] if r["metric"] == "success_rate" and r["model"] in methods
+    ]
+    fields = {"rows": len(found["rows"])}
+    if not covered:
+        return fields
+    least = min(r["mean"] for r in covered)
+    return fields | {"least_coverage": least, "mean_success": sum(good) / len(good)}
 
 
 if __name__ == "__main__":

@@ -55,3 +55,18 @@ def test_both_halves_of_the_memory_cell_are_the_same_circuit_mirrored():
     y = outputs(np.stack([x, np.roll(x, 3)]))
     assert np.all((y < -100.0) & (y > -250.0))
     np.testing.assert_allclose(y[0], y[1, ::-1], atol=0.5)
+
+
+def test_searches_are_measured_without_any_method(tmp_path):
+    study = load_script("studies/study_sigma")
+    config = study.Config(
+        problems=("linear",), probabilities=(1e-6,), methods=(), searches=("gradient_corner",),
+        search_seeds=2, search_most=20, dim=12, out=tmp_path / "cells",
+        record=tmp_path / "table.json",
+    )  # fmt: skip
+    rows = study.main(config)["rows"]
+    by = {(r["model"], r["metric"]): r["mean"] for r in rows}
+    assert by["gradient_corner", "success_rate"] == 1.0
+    assert by["gradient_corner", "first_failure"] == 14.0  # nominal, a difference each, the corner
+    fields = study.result({"rows": rows})
+    assert fields == {"rows": len(rows)}

@@ -23,10 +23,10 @@ from fusion.lattice.categorical import CategoricalConfig
 from fusion.lattice.deep_lattice import DeepLatticeConfig
 from fusion.lattice.ensemble import EnsembleConfig
 from fusion.lattice.estimators import LatticeClassifier, LatticeRegressor
+from fusion.lattice.features import Feature
 from fusion.lattice.lattice_config import LatticeConfig
 from fusion.lattice.linear import LinearConfig
 from fusion.lattice.optimizer import with_projection
-from fusion.lattice.premade import Feature
 from fusion.lattice.pwl import PWLConfig
 from fusion.lattice.tagged import check_tree, project_tree
 

@@ -9,7 +9,7 @@ from jaxtyping import Float
 from numpy.typing import ArrayLike
 
 from fusion.lattice.checks import refusal
-from fusion.lattice.ensemble import random_features
+from fusion.lattice.subsets import random_features
 
 RIDGE = 1e-3
 """Weight of the squared coefficients of a pair, as a share of the rows."""

@@ -1,9 +1,16 @@
-"""Ensembles of tiny lattices, each over a few of many inputs."""
+"""Ensembles of tiny lattices, each over a few of many inputs.
+
+Constraints between inputs are asked of the ensemble and imposed on each lattice that holds these
+inputs. They hold for the mean where no lattice speaks against them alone: a lattice of the weak
+input without the dominant one has a slope in it that nothing bounds. Such subsets are refused.
+"""
 
 from __future__ import annotations
 
 import dataclasses
-from typing import Literal
+import functools
+from functools import partial
+from typing import Any, Literal
 
 import jax
 import jax.numpy as jnp
@@ -21,47 +28,7 @@ from fusion.lattice.checks import (
 )
 from fusion.lattice.constraints import project_vertices, violation
 from fusion.lattice.lattice_config import LatticeConfig, LatticeParams
-
-
-def random_features(
-    seed: int, n_inputs: int, n_lattices: int, rank: int
-) -> tuple[tuple[int, ...], ...]:
-    """Random subsets of the inputs, every input in as equal a number of them as can be.
-
-    Args:
-        seed: of numpy's generator; the same seed gives the same subsets.
-        n_inputs: inputs to choose from.
-        n_lattices: subsets.
-        rank: inputs in each, at most `n_inputs`.
-
-    Returns:
-        `n_lattices` tuples of `rank` different inputs.
-
-    Raises:
-        ValueError: `rank` is out of range, or the lattices have too few places for all inputs.
-
-    Source: Canini et al. (2016), Fast and flexible monotonic functions with ensembles of
-    lattices: random tiny lattices. Deviation: they draw subsets independently; here counts are
-    balanced, so that no input is left out.
-    """
-    if not 1 <= rank <= n_inputs:
-        raise refusal("rank", rank, f"1..{n_inputs}, the number of inputs", "lower the rank")
-    if n_lattices * rank < n_inputs:
-        raise refusal(
-            "n_lattices",
-            n_lattices,
-            f"{-(-n_inputs // rank)} or more: {n_inputs} inputs need a place at rank {rank}",
-            "use more lattices or a higher rank",
-        )
-    rng = np.random.default_rng(seed)
-    used = np.zeros(n_inputs)
-    subsets = []
-    for _ in range(n_lattices):
-        # The least used inputs first, ties at random.
-        chosen = np.lexsort((rng.random(n_inputs), used))[:rank]
-        used[chosen] += 1
-        subsets.append(tuple(int(i) for i in np.sort(chosen)))
-    return tuple(subsets)
+from fusion.lattice.relations import BUILDERS
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,9 +43,13 @@ class EnsembleConfig:
         output_range: `(low, high)`, either of which may be `None`.
         interpolation: "hypercube" or "simplex".
         n_iterations: passes of Dykstra's algorithm.
+        edgeworth_trust, trapezoid_trust, dominance, range_dominance, joint_monotonicity,
+            joint_unimodality: constraints between inputs of the ensemble, as `LatticeConfig` has
+            them between its own.
 
     Raises:
-        ValueError, TypeError: subsets or directions that mean nothing, by name and value.
+        ValueError, TypeError: subsets, directions or constraints that mean nothing, or constraints
+            that would not hold for the mean of lattices of these subsets, by name and value.
 
     Example:
         >>> EnsembleConfig(4, features=((0, 1), (2, 3)), monotonicity=(1, 0, 0, 0)).lattice_size
@@ -92,9 +63,15 @@ class EnsembleConfig:
     output_range: tuple[float | None, float | None] = (None, None)
     interpolation: Literal["hypercube", "simplex"] = "hypercube"
     n_iterations: int = 10
+    edgeworth_trust: tuple[tuple[int, int, int], ...] = ()
+    trapezoid_trust: tuple[tuple[int, int, int], ...] = ()
+    dominance: tuple[tuple[int, int], ...] = ()
+    range_dominance: tuple[tuple[int, int], ...] = ()
+    joint_monotonicity: tuple[tuple[int, int, int], ...] = ()
+    joint_unimodality: tuple[tuple[tuple[int, ...], int], ...] = ()
 
     def __post_init__(self) -> None:
-        """Refuse subsets and directions that mean nothing; `LatticeConfig` checks the rest."""
+        """Refuse subsets and constraints that mean nothing; `LatticeConfig` checks the rest."""
         require_static(self)
         require_count("n_inputs", self.n_inputs)
         require_count("lattice_size", self.lattice_size, 2)
@@ -114,7 +91,8 @@ class EnsembleConfig:
                     "make them with random_features",
                 )
         require_signs("monotonicity", self.monotonicity, self.n_inputs)
-        _ = self.lattice
+        self._check_relations()
+        _ = self.lattices
 
     @property
     def lattice(self) -> LatticeConfig:
@@ -132,6 +110,55 @@ class EnsembleConfig:
         signs = np.asarray(self.monotonicity or (0,) * self.n_inputs, np.int32)
         return signs[np.asarray(self.features)]
 
+    @property
+    def lattices(self) -> tuple[LatticeConfig, ...]:
+        """Each lattice with the directions of its inputs and the constraints between them."""
+        return _lattices(self)
+
+    def _check_relations(self) -> None:
+        sizes = (self.lattice_size,) * self.n_inputs
+        signs = np.asarray(self.monotonicity or (0,) * self.n_inputs)
+        for name, build in BUILDERS.items():
+            for entry in getattr(self, name):
+                axes = build(name, entry, sizes, signs).axes
+                alone = set(axes[_MAY_STAND_ALONE[name] :])
+                for subset in self.features:
+                    if alone & set(subset) and not set(axes) <= set(subset):
+                        raise refusal(
+                            name, entry, f"all of inputs {axes} in each subset that holds one of "
+                            f"{sorted(alone)}, unlike {subset}",
+                            "make the subsets with random_features(together=...)",
+                        )  # fmt: skip
+
+
+# How many of a constraint's inputs, from the first on, may be in a lattice without the others: the
+# two of Edgeworth trust, of which a lattice of one has no mixed difference; the main input, the
+# dominant one; none of the joint constraints.
+_MAY_STAND_ALONE = {
+    "edgeworth_trust": 2, "trapezoid_trust": 1, "dominance": 1, "range_dominance": 1,
+    "joint_monotonicity": 0, "joint_unimodality": 0,
+}  # fmt: skip
+
+
+@functools.lru_cache(maxsize=128)
+def _lattices(config: EnsembleConfig) -> tuple[LatticeConfig, ...]:
+    def local(name: str, subset: tuple[int, ...]) -> tuple[Any, ...]:
+        joint = name == "joint_unimodality"
+        found = []
+        for entry in getattr(config, name):
+            axes, rest = (entry[0], entry[1:]) if joint else (entry[:2], entry[2:])
+            if set(axes) <= set(subset):
+                places = tuple(subset.index(axis) for axis in axes)
+                found.append((places, *rest) if joint else (*places, *rest))
+        return tuple(found)
+
+    made = []
+    for subset, signs in zip(config.features, config.signs, strict=True):
+        relations: dict[str, Any] = {name: local(name, subset) for name in BUILDERS}
+        directions = tuple(int(s) for s in signs)
+        made.append(dataclasses.replace(config.lattice, monotonicity=directions, **relations))
+    return tuple(made)
+
 
 def init(key: Key[Array, ""], config: EnsembleConfig) -> LatticeParams:
     """Planes, as in `lattice_layer.init`, with the directions of each lattice's inputs.
@@ -147,12 +174,9 @@ def init(key: Key[Array, ""], config: EnsembleConfig) -> LatticeParams:
         ValueError: a legacy key.
     """
     require_key(key)
-    signs = config.signs
-    lattices = []
-    for row, lattice_key in zip(signs, jax.random.split(key, len(signs)), strict=True):
-        lattice = dataclasses.replace(config.lattice, monotonicity=tuple(int(s) for s in row))
-        lattices.append(lattice_layer.init(lattice_key, lattice).vertices)
-    return LatticeParams(jnp.stack(lattices))
+    keys = jax.random.split(key, len(config.lattices))
+    made = [lattice_layer.init(k, c).vertices for k, c in zip(keys, config.lattices, strict=True)]
+    return LatticeParams(jnp.stack(made))
 
 
 def apply(
@@ -180,7 +204,7 @@ def apply(
 
 
 def project(config: EnsembleConfig, params: LatticeParams) -> LatticeParams:
-    """Each lattice projected onto its constraints, all of them in one vmapped program.
+    """Each lattice projected onto its constraints, equal ones in one vmapped program.
 
     Args:
         config: of the ensemble.
@@ -189,17 +213,26 @@ def project(config: EnsembleConfig, params: LatticeParams) -> LatticeParams:
     Returns:
         LatticeParams with `check(...) == 0`.
     """
-    lattice = config.lattice
-    signs = config.signs
-    if np.all(signs == signs[0]):
-        row = signs[0]
-        each = jax.vmap(lambda v: project_vertices(lattice, row, v))
-        return LatticeParams(each(params.vertices))
-    mixed = jax.vmap(lambda v, row: project_vertices(lattice, row, v))
-    return LatticeParams(mixed(params.vertices, jnp.asarray(signs)))
+    lattice, signs = config.lattice, config.signs
+    alike: dict[LatticeConfig, list[int]] = {}
+    for place, each in enumerate(config.lattices):
+        alike.setdefault(each, []).append(place)
+    if len(alike) > 1 and not any(each.relations for each in alike):
+        # Directions alone may be traced: one program for all lattices.
+        mixed = jax.vmap(lambda v, row: project_vertices(lattice, row, v))
+        return LatticeParams(mixed(params.vertices, jnp.asarray(signs)))
+    vertices = params.vertices
+    for each, places in alike.items():
+        chosen = np.asarray(places)
+        same = jax.vmap(partial(project_vertices, each, each.signs))
+        vertices = vertices.at[chosen].set(same(vertices[chosen]))
+    return LatticeParams(vertices)
 
 
 def check(config: EnsembleConfig, params: LatticeParams) -> Float[Array, ""]:
     """Largest violation in any lattice; 0 where all constraints hold."""
-    each = jax.vmap(lambda v, row: violation(config.lattice, row, v))
-    return jnp.max(each(params.vertices, jnp.asarray(config.signs)))
+    if not any(each.relations for each in config.lattices):
+        each = jax.vmap(lambda v, row: violation(config.lattice, row, v))
+        return jnp.max(each(params.vertices, jnp.asarray(config.signs)))
+    pairs = zip(config.lattices, params.vertices, strict=True)
+    return jnp.max(jnp.stack([violation(lattice, lattice.signs, v) for lattice, v in pairs]))

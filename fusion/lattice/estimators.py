@@ -13,10 +13,11 @@ import optax
 
 from fusion.lattice import premade
 from fusion.lattice.checks import refusal, require_count
-from fusion.lattice.ensemble import random_features
+from fusion.lattice.features import Feature, together
 from fusion.lattice.optimizer import with_projection
-from fusion.lattice.premade import CalibratedConfig, Feature
+from fusion.lattice.premade import CalibratedConfig
 from fusion.lattice.quantiles import quantile_keypoints
+from fusion.lattice.subsets import random_features
 
 
 class _Estimator:
@@ -26,7 +27,9 @@ class _Estimator:
         self,
         features: tuple[Feature, ...] | None = None,
         *,
+        relations: tuple[tuple[Any, ...], ...] = (),
         kind: Literal["linear", "lattice", "ensemble"] = "lattice",
+        n_output_keypoints: int = 10,
         n_keypoints: int = 10,
         lattice_size: int = 2,
         n_lattices: int = 8,
@@ -37,7 +40,9 @@ class _Estimator:
         seed: int = 0,
     ) -> None:
         self.features = features
+        self.relations = relations
         self.kind = kind
+        self.n_output_keypoints = n_output_keypoints
         self.n_keypoints = n_keypoints
         self.lattice_size = lattice_size
         self.n_lattices = n_lattices
@@ -74,10 +79,13 @@ class _Estimator:
             made[i] = dataclasses.replace(features[i], keypoints=keypoints)
         subsets: tuple[tuple[int, ...], ...] = ()
         if self.kind == "ensemble":
-            subsets = random_features(self.seed, len(made), self.n_lattices, self.rank)
+            groups = together(made, self.relations)
+            subsets = random_features(
+                self.seed, len(made), self.n_lattices, self.rank, together=groups
+            )
         return CalibratedConfig(
-            tuple(made), self.kind, subsets, self.lattice_size,
-            missing=bool(np.isnan(x[:, numbers]).any()),
+            tuple(made), self.kind, subsets, self.lattice_size, self.n_output_keypoints,
+            missing=bool(np.isnan(x[:, numbers]).any()), relations=self.relations,
         )  # fmt: skip
 
     def _fit(self, x: Any, y: np.ndarray) -> None:
@@ -138,7 +146,9 @@ class LatticeRegressor(_Estimator):
     Args:
         features: what is known of each column; `None` is a free number for each. Their keypoints
             are set to quantiles of the data.
+        relations: between features by name, see `CalibratedConfig`.
         kind: "linear", "lattice" or "ensemble".
+        n_output_keypoints: of the output calibrator; some relations need a straight one, 2.
         n_keypoints: keypoints of each calibrator.
         lattice_size: vertices along each axis of a lattice.
         n_lattices: lattices of an ensemble.

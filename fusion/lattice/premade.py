@@ -2,7 +2,10 @@
 
 Every input goes through its own calibrator (piecewise linear, or one output for each category),
 the calibrated inputs through one linear layer, lattice or ensemble, and the result through a rising
-output calibrator. Directions and orders asked of a feature hold for the whole model.
+output calibrator. Directions and orders asked of a feature hold for the whole model. Relations
+between features are those of a lattice (`LatticeConfig`) between the calibrated inputs. Most of
+them compare outputs or the signs of slopes, which a rising output calibrator keeps; Edgeworth trust
+and range dominance compare differences of outputs, which only a straight one keeps.
 """
 
 from __future__ import annotations
@@ -21,56 +24,11 @@ from fusion.lattice.checks import (
     require_count,
     require_key,
     require_range,
-    require_signs,
     require_static,
     require_width,
 )
+from fusion.lattice.features import Feature, related_positions
 from fusion.lattice.lattice_config import LatticeConfig
-
-
-@dataclasses.dataclass(frozen=True)
-class Feature:
-    """What is known of one input.
-
-    Attributes:
-        name: of the input.
-        monotonicity: -1 (the output falls with it), 0 (free) or +1 (rises); numbers only.
-        convexity: of its calibrator, -1, 0 or +1; numbers only.
-        keypoints: positions of the calibrator's keypoints; numbers only.
-        n_categories: categories `0..n_categories - 1`; None for a number.
-        order: pairs `(low, high)` of categories whose outputs are ordered.
-
-    Raises:
-        ValueError, TypeError: directions of categories, or orders of numbers.
-
-    Example:
-        >>> Feature("age", monotonicity=1).n_categories is None
-        True
-    """
-
-    name: str
-    monotonicity: int = 0
-    convexity: int = 0
-    keypoints: tuple[float, ...] = (0.0, 1.0)
-    n_categories: int | None = None
-    order: tuple[tuple[int, int], ...] = ()
-
-    def __post_init__(self) -> None:
-        """Refuse directions of categories and orders of numbers."""
-        require_static(self)
-        require_signs("monotonicity", (self.monotonicity,), 1)
-        require_signs("convexity", (self.convexity,), 1)
-        if self.n_categories is None and self.order:
-            raise refusal("order", self.order, "() for a number", "give n_categories")
-        if self.n_categories is not None and (self.monotonicity or self.convexity):
-            raise refusal(
-                "monotonicity", self.monotonicity, "0 for categories", "give order, pairs of them"
-            )
-
-    @property
-    def sign(self) -> int:
-        """1 where the model must rise with the calibrated input."""
-        return int(self.monotonicity != 0 or bool(self.order))
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,6 +44,15 @@ class CalibratedConfig:
         output_range: `(low, high)` of the output, either of which may be None.
         missing: numbers that are NaN get a learned output of their own.
         interpolation: of the lattices.
+        relations: of features by name, each the name of a constraint of `LatticeConfig` and its
+            entry: `("edgeworth_trust", "rating", "reviews", 1)`, `("dominance", "a", "b")`,
+            `("joint_unimodality", ("a", "b"), -1)`. The direction of a trust is that of the
+            conditional feature, also where the model falls with it. A linear model has dominances
+            only; subsets of an ensemble hold related features together, see
+            `features.together`.
+
+    Raises:
+        ValueError: what contradicts itself, by name and value.
     """
 
     features: tuple[Feature, ...]
@@ -96,6 +63,7 @@ class CalibratedConfig:
     output_range: tuple[float | None, float | None] = (None, None)
     missing: bool = False
     interpolation: Literal["hypercube", "simplex"] = "hypercube"
+    relations: tuple[tuple[Any, ...], ...] = ()
 
     def __post_init__(self) -> None:
         """Refuse what contradicts itself; the layers check the rest."""
@@ -155,14 +123,21 @@ class CalibratedConfig:
     def body(self) -> Any:
         """Configuration of what combines the calibrated inputs, to [0, 1] or [-1, 1]."""
         signs = tuple(f.sign for f in self.features)
+        related: dict[str, Any] = dict(related_positions(self.features, self.relations))
+        self._check_relations(related)
         if self.kind == "linear":
-            return linear.LinearConfig(len(signs), monotonicity=signs, normalized=True)
+            # All inputs have the range [0, 1]: wider over the range is steeper.
+            pairs = tuple(pair for entries in related.values() for pair in entries)
+            return linear.LinearConfig(
+                len(signs), monotonicity=signs, dominance=pairs, normalized=True
+            )
         if self.kind == "lattice":
             return LatticeConfig(
                 (self.lattice_size,) * len(signs),
                 signs,
                 output_range=(0.0, 1.0),
                 interpolation=self.interpolation,
+                **related,
             )
         return ensemble.EnsembleConfig(
             len(signs),
@@ -171,7 +146,22 @@ class CalibratedConfig:
             signs,
             output_range=(0.0, 1.0),
             interpolation=self.interpolation,
+            **related,
         )
+
+    def _check_relations(self, related: dict[str, Any]) -> None:
+        for name in related:
+            if self.kind == "linear" and name not in ("dominance", "range_dominance"):
+                raise refusal(
+                    "relations", name, "dominance or range_dominance in a linear model",
+                    "use kind='lattice' or 'ensemble'",
+                )  # fmt: skip
+            bent = self.n_output_keypoints > 2
+            if bent and name in ("edgeworth_trust", "range_dominance"):
+                raise refusal(
+                    "relations", name, "a straight output calibrator beside it, since a bent one "
+                    "changes differences of outputs", "set n_output_keypoints=2",
+                )  # fmt: skip
 
     @property
     def output(self) -> pwl.PWLConfig:

@@ -33,11 +33,11 @@ from fusion.lattice import (
 from fusion.lattice.categorical import CategoricalParams
 from fusion.lattice.checks import require_key
 from fusion.lattice.deep_lattice import DeepLatticeParams
-from fusion.lattice.ensemble import random_features
 from fusion.lattice.lattice_config import LatticeParams
 from fusion.lattice.lattice_layer import vertices
 from fusion.lattice.linear import LinearParams
 from fusion.lattice.pwl import PWLParams, keypoints
+from fusion.lattice.subsets import random_features
 from fusion.targets import TargetConfig
 
 MODULES = (

@@ -14,8 +14,12 @@ Parts, each written to `results/study_circuit_parity.json` as soon as it is meas
 - `dcdc_ngspice`: DC-DC converter against a transient of all transistors over all periods, and that
   transient against itself with another step.
 - `dcdc_grid`: DC-DC specifications on the shipped grid against steps ten times shorter.
+- `dcdc_far`: the DC-DC converter where failures are, normal samples moved to -6 to 6 sigma along
+  the slope of each specification, and at other loads, against the same transient.
+- `light_ngspice`: the converter at light load, the same points and other loads, against a transient
+  of comparator, drivers and switches with an ideal controller.
 
-About 8 CPU-minutes in all, most of it ngspice's.
+About 10 CPU-minutes in all, most of it ngspice's.
 """
 
 from __future__ import annotations
@@ -25,6 +29,14 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.records.converter_parity import (
+    dcdc_far,
+    dcdc_grid,
+    dcdc_ngspice,
+    light_ngspice,
+    ranks,
+    spread,
+)
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     provenance,
@@ -48,11 +60,14 @@ class Config:
     """Sizes of the study."""
 
     parts: tuple[str, ...] = (
-        "ldo_ngspice", "ldo_far", "ldo_grid", "box", "dcdc_ngspice", "dcdc_grid",
+        "ldo_ngspice", "ldo_far", "ldo_grid", "box", "dcdc_ngspice", "dcdc_grid", "dcdc_far",
+        "light_ngspice",
     )  # fmt: skip
     ldo_samples: int = 200
     far_samples: int = 200
     dcdc_samples: int = 40
+    far_dcdc_samples: int = 8
+    """Of each specification, and at each other load."""
     grid_samples: int = 64
     box_samples: int = 4096
     max_step: float = 0.5e-9
@@ -61,32 +76,6 @@ class Config:
     """ngspice processes at a time."""
     seed: int = 0
     out: Path = repository.RESULTS / "study_circuit_parity.json"
-
-
-def ranks(a: Any, b: Any, names: tuple[str, ...]) -> dict[str, float]:
-    """Spearman correlation of every column."""
-    from scipy.stats import spearmanr
-
-    return {n: float(spearmanr(a[:, k], b[:, k]).statistic) for k, n in enumerate(names)}
-
-
-def spread(difference: Any, values: Any, names: tuple[str, ...]) -> dict[str, dict[str, float]]:
-    """Of every column: largest, mean and standard deviation of a difference; spread of values."""
-    import numpy as np
-
-    found = {}
-    for k, name in enumerate(names):
-        move, sd = difference[:, k], float(np.std(values[:, k]))
-        found[name] = {
-            "max": float(np.abs(move).max()),
-            "median": float(np.median(np.abs(move))),
-            "mean": float(move.mean()),
-            "sd": float(move.std()),
-            "spread": sd,
-            "max_share": float(np.abs(move).max()) / sd,
-            "sd_share": float(move.std()) / sd,
-        }
-    return found
 
 
 def ldo_ngspice(config: Config) -> dict[str, Any]:
@@ -193,59 +182,6 @@ def box(config: Config) -> dict[str, Any]:
     return result
 
 
-def dcdc_ngspice(config: Config) -> dict[str, Any]:
-    """DC-DC converter against every transistor switching in every period."""
-    import numpy as np
-
-    from failure.circuits.buck.circuit import make_dcdc
-
-    x = np.random.default_rng(config.seed).normal(size=(config.dcdc_samples, 44))
-    result: dict[str, Any] = {"samples": len(x), "max_step": config.max_step}
-    circuit = make_dcdc("level1")
-    ours, status = (np.asarray(a) for a in circuit.simulate(x))
-    names = circuit.spec_names
-    theirs, failed = circuit.reference(x, max_step=config.max_step, workers=config.workers)
-    coarse, failed_too = circuit.reference(
-        x, max_step=2.0 * config.max_step, workers=config.workers
-    )
-    good = (status == 0) & (failed == 0) & (failed_too == 0)
-    result["compared"] = int(good.sum())
-    result["rank_correlation"] = ranks(ours[good], theirs[good], names)
-    result["difference"] = spread((ours - theirs)[good], theirs[good], names)
-    result["ngspice_with_twice_the_step"] = {
-        "rank_correlation": ranks(coarse[good], theirs[good], names),
-        "difference": spread((coarse - theirs)[good], theirs[good], names),
-    }
-    return result
-
-
-def dcdc_grid(config: Config) -> dict[str, Any]:
-    """DC-DC specifications on the shipped grid and with steps ten times shorter."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from failure.circuits.buck import converter
-
-    x = np.random.default_rng(config.seed + 1).normal(size=(44, config.grid_samples))
-    result: dict[str, Any] = {"samples": config.grid_samples}
-    names = tuple(s.name for s in converter.SPECS)
-    with jax.enable_x64(True):
-
-        def solved(refine: int) -> Any:
-            run = jax.jit(lambda u: converter.solve_dcdc(u, refine=refine, points=8)[0])
-            return np.asarray(run(jnp.asarray(x))).T
-
-        fine = solved(10)
-        for refine in (1, 2, 4):
-            values = solved(refine)
-            result[f"steps_divided_by_{refine}"] = {
-                "difference": spread(values - fine, fine, names),
-                "rank_correlation": ranks(values, fine, names),
-            }
-    return result
-
-
 PARTS: dict[str, Callable[[Config], dict[str, Any]]] = {
     "ldo_ngspice": ldo_ngspice,
     "ldo_far": ldo_far,
@@ -253,6 +189,8 @@ PARTS: dict[str, Callable[[Config], dict[str, Any]]] = {
     "box": box,
     "dcdc_ngspice": dcdc_ngspice,
     "dcdc_grid": dcdc_grid,
+    "dcdc_far": dcdc_far,
+    "light_ngspice": light_ngspice,
 }
 
 
@@ -287,6 +225,12 @@ def summary(held: dict[str, Any]) -> dict[str, float]:
         found["not_converged"] = held["box"]["ldo"]["share"]
     if "dcdc_ngspice" in held:
         found["dcdc_rank"] = min(held["dcdc_ngspice"]["rank_correlation"].values())
+    if "dcdc_far" in held:
+        part = held["dcdc_far"]["6_sigma"]["difference"]
+        found["far_dcdc_mV"] = 1e3 * max(p["max"] for p in part.values())
+    if "light_ngspice" in held:
+        part = held["light_ngspice"]["6_sigma"]["difference"]
+        found["light_mV"] = 1e3 * max(p["max"] for p in part.values())
     if "dcdc_grid" in held:
         part = held["dcdc_grid"]["steps_divided_by_1"]["difference"]
         found["dcdc_grid_share"] = max(p["max_share"] for p in part.values())

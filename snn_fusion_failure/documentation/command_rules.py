@@ -203,6 +203,7 @@ RULES = (
     ),
     Rule("study_rare_events.py", "--runs 1 --n-importance 50 --n-subset 100 --replicates 3"),
     Rule("bench_circuits.py", "--batch 2 --repeats 1 --ngspice-samples 2", needs="ngspice"),
+    Rule("bench_bo_steps.py", "--points 60 --dim 4 --steps 2 --out runs/bench_bo_steps.json"),
     Rule("bench_revnet.py", "--dim 6 --samples 16 --depths 1 2"),
     # All chapters.
     Rule("reproduce.py --report-only"),
@@ -276,6 +277,7 @@ AREAS = {
     "circuits": (
         "find_failures", "study_failures", "study_active", "study_circuits", "study_parity",
         "study_rare_events", "study_sigma", "bench_circuits", "bench_revnet", "bench_bo",
+        "bench_bo_steps",
     ),
 }  # fmt: skip
 """Scripts that need each other's files or share compiled programs; the rest is one area, too."""

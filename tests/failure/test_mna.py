@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 from scipy.optimize import brentq
 
-from failure.circuits.solver.elimination import eliminate
+from failure.circuits.solver.elimination import eliminate, full_matrix
 from failure.circuits.solver.mna import residual, source_current, stamps
 from failure.circuits.solver.mosfet import NMOS, ekv
 from failure.circuits.solver.netlist import (
@@ -35,20 +35,21 @@ def solve(netlist: Netlist) -> dict[str, float]:
     return dict(zip(system.unknowns, np.asarray(solution.v)[:, 0].tolist(), strict=True))
 
 
+DIVIDER = Netlist(
+    "divider",
+    (
+        VoltageSource("V1", "a", "0", 3.0),
+        Resistor("R1", "a", "b", 1e3),
+        VoltageSource("V2", "b", "c", 0.5),
+        Inductor("L1", "c", "d", 1e-6),
+        Switch("S1", "d", "0", 1e3, 1e9, control=1.0),
+        CurrentSource("I1", "0", "d", 1e-3),
+    ),
+)
+
+
 def test_divider_with_floating_source_inductor_and_switch() -> None:
-    v = solve(
-        Netlist(
-            "divider",
-            (
-                VoltageSource("V1", "a", "0", 3.0),
-                Resistor("R1", "a", "b", 1e3),
-                VoltageSource("V2", "b", "c", 0.5),
-                Inductor("L1", "c", "d", 1e-6),
-                Switch("S1", "d", "0", 1e3, 1e9, control=1.0),
-                CurrentSource("I1", "0", "d", 1e-3),
-            ),
-        )
-    )
+    v = solve(DIVIDER)
     current = (3.0 - 0.5 - 1.0) / 2e3  # 1 mA into 1 kOhm lifts d by 1 V
     assert v["b"] == pytest.approx(3.0 - 1e3 * current, abs=1e-8)
     assert v["c"] == pytest.approx(v["b"] - 0.5, abs=1e-12)
@@ -115,6 +116,23 @@ def test_elimination_solves_the_assembled_matrix() -> None:
         np.testing.assert_allclose(x[:, k], np.linalg.solve(dense[k], f[:, k]), rtol=1e-10)
 
 
+@pytest.mark.parametrize("netlist", [STAGE, DIVIDER], ids=["stage", "divider"])
+def test_incidence_matrices_are_the_same_equations(netlist) -> None:
+    """Residual and Jacobian, entry by entry and by matrices; the solution of both."""
+    sparse, dense = (compile_netlist(netlist, dense=d) for d in (False, True))
+    with jax.enable_x64(True):
+        values = nominal_values(sparse)
+        v = jnp.asarray(np.random.default_rng(0).normal(size=(sparse.n, 2)))
+        values = values._replace(volts=values.volts * jnp.array([[1.0, 1.1]]))
+        f, entries = residual(sparse, stamps(sparse, values), v)
+        g, matrix = residual(dense, stamps(dense, values), v)
+        np.testing.assert_allclose(g, f, rtol=1e-12, atol=1e-15)
+        np.testing.assert_allclose(matrix, full_matrix(sparse, entries, 2), rtol=1e-12, atol=1e-18)
+        np.testing.assert_allclose(
+            eliminate(dense, matrix, g), eliminate(sparse, entries, f), rtol=1e-9, atol=1e-12
+        )
+
+
 @pytest.fixture(scope="module")
 def stage_out():
     """Output voltage of the stage as a function of threshold shifts `[2, b]`, and its status."""
@@ -159,7 +177,7 @@ def test_a_sample_that_does_not_converge_is_flagged() -> None:
     assert status.tolist() == [Status.GOOD, Status.NOT_CONVERGED]
 
 
-def lc_error(steps: int) -> float:
+def lc_error(steps: int, dense: bool) -> float:
     """Largest error of an undamped LC ring that starts when a current is cut."""
     netlist = Netlist(
         "LC",
@@ -170,7 +188,7 @@ def lc_error(steps: int) -> float:
             Resistor("R1", "a", "0", 1e9),
         ),
     )
-    system = compile_netlist(netlist)
+    system = compile_netlist(netlist, dense=dense)
     time = grid((0.0, 3e-7, steps, 1.0), euler_steps=1)  # the source jumps
     wave = np.zeros((steps + 1, 1))
     wave[0] = 1e-3
@@ -190,8 +208,9 @@ def lc_error(steps: int) -> float:
     )
 
 
-def test_trapezoidal_rule_is_of_second_order() -> None:
-    coarse, fine = lc_error(100), lc_error(200)
+@pytest.mark.parametrize("dense", [False, True])
+def test_trapezoidal_rule_is_of_second_order(dense: bool) -> None:
+    coarse, fine = lc_error(100, dense), lc_error(200, dense)
     assert fine < 1e-2
     assert coarse / fine == pytest.approx(4.0, rel=0.1)
 

@@ -31,6 +31,25 @@ def test_inverse_is_exact_for_every_size(dim, depth, width, seed):
             assert float(jnp.max(jnp.abs(revnet.inverse(params, z) - x))) <= tolerance
 
 
+@pytest.mark.parametrize("scale", [1.0, 8.0, 64.0])
+def test_the_inverse_error_at_extreme_weights_stays_below_its_bound(scale):
+    """A hundred times what training makes: what is lost is known beforehand."""
+    with jax.enable_x64(True):
+        for dtype in (jnp.float32, jnp.float64):
+            params = trained(8, 4, 4, 0, dtype)
+            params = params._replace(k1=scale * params.k1, k2=scale * params.k2)
+            x = 3.0 * jax.random.normal(jax.random.key(1), (16, 8), dtype)
+            back = revnet.inverse(params, revnet.forward_stored(params, x))
+            error = np.linalg.norm(np.asarray(back - x, np.float64), axis=1)
+            bound = revnet.inverse_error_bound(params, x)
+            assert np.all(np.isfinite(error)) and np.all(error <= bound)
+            if scale == 1.0:
+                assert bound.max() < 1e6 * float(jnp.finfo(dtype).eps)
+            # Numbers as large as a drive makes them lose their last digits, not more.
+            size = float(jnp.max(jnp.abs(revnet.forward_stored(params, x))))
+            assert error.max() <= 1e3 * size * float(jnp.finfo(dtype).eps)
+
+
 def test_one_block_is_equation_4_4():
     with jax.enable_x64(True):
         params = trained(6, 1, 5, 0, jnp.float64)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Int
 from failure.circuits.buck.schematic import (
     AMPLIFIER,
     AMPLIFIER_MOSFETS,
+    LOAD_HEAVY,
     POWER,
     POWER_MOSFETS,
     RAMP_HIGH,
@@ -38,8 +39,8 @@ _EDGE_V = (
     RAMP_LOW,
     RAMP_LOW,
 )
-_VALLEY, _PEAK = 0.12, 0.28
-"""Inductor current at the two edges under the heavy load [A]."""
+_SWING = 0.08
+"""Inductor current at the two edges, below and above the load [A]."""
 
 
 def edge_grid(refine: int = 1) -> Grid:
@@ -115,7 +116,12 @@ class Edges(NamedTuple):
 
 
 def edges(
-    u: Float[Array, "17 2 b"], *, model: str = "ekv", refine: int = 1, dense: bool = False
+    u: Float[Array, "17 2 b"],
+    *,
+    model: str = "ekv",
+    refine: int = 1,
+    dense: bool = False,
+    load: float | Float[Array, ""] = LOAD_HEAVY,
 ) -> Edges:
     """Delays and on resistances by a transient of comparator, drivers and switches.
 
@@ -126,6 +132,7 @@ def edges(
         model: MOSFET model.
         refine: divides every time step.
         dense: see `System.dense`.
+        load: what the inductor carries on average [A].
     Returns:
         Edges.
     """
@@ -133,9 +140,12 @@ def edges(
     time = edge_grid(refine)
     values = variation(system, POWER_MOSFETS, u)
     ramp = np.interp(time.t, _EDGE_T, _EDGE_V)
-    coil = np.interp(time.t, [_T1, _T3], [_VALLEY, _PEAK])
+    valley, peak = load - _SWING, load + _SWING
+    coil = load + _SWING * np.interp(time.t, [_T1, _T3], [-1.0, 1.0])
     row = [v.name for v in POWER.of(VoltageSource)].index("Vramp")
-    first = values._replace(volts=values.volts.at[row].set(float(ramp[0])))
+    first = values._replace(
+        volts=values.volts.at[row].set(float(ramp[0])), amps=jnp.full_like(values.amps, valley)
+    )
     start = dc(system, first)
     waves = {
         "Vramp": jnp.asarray(ramp, u.dtype).reshape(-1, 1),
@@ -151,4 +161,4 @@ def edges(
     rise = _T1 - (area - low * _T1) / (high - low) - 15e-9
     length = float(time.t[-1] - time.t[at_fall])
     fall = (jnp.sum(mean[at_fall:], axis=0) - bottom * length) / (top - bottom)
-    return Edges(rise, fall, (V_DD - top) / _PEAK, -bottom / _PEAK, end.status)
+    return Edges(rise, fall, (V_DD - top) / peak, -bottom / peak, end.status)

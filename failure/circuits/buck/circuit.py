@@ -3,22 +3,12 @@
 from __future__ import annotations
 
 from functools import lru_cache, partial
-from typing import Any
-
-import numpy as np
 
 from failure.circuits.buck import converter, light_load
+from failure.circuits.buck.light_reference import light_reference
 from failure.circuits.buck.reference import dcdc_reference
 from failure.circuits.buck.schematic import MOSFETS, QUANTITIES
 from failure.circuits.protocol import Circuit, varied_circuit
-
-
-def _no_reference(x: np.ndarray, **options: Any) -> tuple[np.ndarray, np.ndarray]:
-    raise ValueError(
-        "circuit='dcdc_light': expected a circuit with an ngspice reference; its controller is an "
-        "ideal state machine; its comparator and edges are those of 'dcdc', which has one"
-    )
-
 
 _NAMES = [m.name for m in MOSFETS]
 
@@ -60,5 +50,5 @@ def make_dcdc_light(model: str = "ekv") -> Circuit:
     return varied_circuit(
         "dcdc_light", model, _NAMES, QUANTITIES, light_load.SPECS,
         partial(light_load.solve_dcdc_light, model=model),
-        reference=_no_reference,
+        reference=light_reference,
     )  # fmt: skip

@@ -39,6 +39,9 @@ from failure.circuits.buck.schematic import (
 from failure.circuits.protocol import Spec
 from failure.status import Status
 
+Load = float | Float[Array, ""]
+"""A load current [A]."""
+
 SPECS = (
     Spec("output_accuracy", "V", "max", "distance of the mean output from the reference, 0.2 A"),
     Spec("overshoot", "V", "max", "peak of the output after the load step, over the reference"),
@@ -52,6 +55,7 @@ def solve_dcdc(
     refine: int = 1,
     points: int = 8,
     dense: bool = False,
+    loads: tuple[Load, Load] = (LOAD_HEAVY, LOAD_LIGHT),
 ) -> tuple[Float[Array, "m b"], Int[Array, "b"]]:
     """Specifications of a batch of samples, batch last.
 
@@ -61,6 +65,7 @@ def solve_dcdc(
         refine: divides the time steps of the edge transient.
         points: output samples in each half period.
         dense: a program that is quicker to compile and slower to run, for gradients.
+        loads: before and after the step [A].
     Returns:
         (specs `[2, b]` in the order of `SPECS`, status `[b]`).
     """
@@ -68,7 +73,7 @@ def solve_dcdc(
     u = x.reshape(len(MOSFETS), 2, batch)
     n_amp = len(AMPLIFIER_MOSFETS)
     amp = amplifier(u[:n_amp], model=model, dense=dense)
-    edge = edges(u[n_amp:], model=model, refine=refine, dense=dense)
+    edge = edges(u[n_amp:], model=model, refine=refine, dense=dense, load=loads[0])
     one = jnp.ones((batch,), x.dtype)
     stage = Stage(
         INDUCTANCE * one, CAPACITANCE * one, R_COIL * one, R_ESR * one, R_COMP * one,
@@ -77,7 +82,7 @@ def solve_dcdc(
     # The period runs from fall to fall; the ramp starts this long after the fall.
     t_ramp = PERIOD - (RAMP_RISE + RAMP_TOP + edge.fall)
 
-    def periods(carry: tuple, load: float, count: int) -> tuple[tuple, tuple]:
+    def periods(carry: tuple, load: Load, count: int) -> tuple[tuple, tuple]:
         low = stage_matrix(stage, 0.0 * one, edge.r_low, load * one)
         high = stage_matrix(stage, V_DD * one, edge.r_high, load * one)
 
@@ -92,10 +97,10 @@ def solve_dcdc(
 
         return jax.lax.scan(one_period, carry, None, length=count)
 
-    start = jnp.stack([0.2 * one, V_REF * one, (V_COMP - V_REF) * one, 0.0 * one, one])
-    carry, (integral, _) = periods((start, 0.5 * PERIOD * one), LOAD_HEAVY, N_BEFORE)
+    start = jnp.stack([loads[0] * one, V_REF * one, (V_COMP - V_REF) * one, 0.0 * one, one])
+    carry, (integral, _) = periods((start, 0.5 * PERIOD * one), loads[0], N_BEFORE)
     mean = (integral[-1] - integral[-1 - 8]) / (8 * PERIOD)
-    _, (_, peak) = periods(carry, LOAD_LIGHT, N_AFTER)
+    _, (_, peak) = periods(carry, loads[1], N_AFTER)
     specs = jnp.stack([jnp.abs(mean - V_REF), jnp.max(peak, axis=0) - V_REF])
     status = jnp.maximum(amp.status, edge.status)
     return specs, jnp.where(jnp.all(jnp.isfinite(specs), axis=0), status, Status.NOT_FINITE)

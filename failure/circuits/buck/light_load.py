@@ -163,7 +163,12 @@ def pfm_cycle(
 
 
 def solve_dcdc_light(
-    x: Float[Array, "d b"], *, model: str = "ekv", refine: int = 1, points: int = 8
+    x: Float[Array, "d b"],
+    *,
+    model: str = "ekv",
+    refine: int = 1,
+    points: int = 8,
+    load: float | Float[Array, ""] = LOAD,
 ) -> tuple[Float[Array, "m b"], Int[Array, "b"]]:
     """Specifications of a batch of samples, batch last.
 
@@ -172,6 +177,7 @@ def solve_dcdc_light(
         model: MOSFET model.
         refine: divides the time steps of the edge transient.
         points: output samples in each conducting segment.
+        load: [A].
     Returns:
         (specs `[2, b]` in the order of `SPECS`, status `[b]`).
     """
@@ -188,7 +194,7 @@ def solve_dcdc_light(
         t_on=T_ON + edge.fall - delay,
         r_high=edge.r_high,
         r_low=edge.r_low,
-        load=LOAD * one,
+        load=load * one,
     )
     v = (schematic.V_REF + 2e-3) * one
     mean, ripple = v, v

@@ -12,11 +12,13 @@ from failure.circuits.solver.decks import sample_decks
 from failure.circuits.solver.netlist import (
     Capacitor,
     CurrentSource,
+    Mosfet,
     Netlist,
     Resistor,
     VoltageSource,
 )
 from failure.circuits.solver.system import compile_netlist
+from failure.circuits.solver.values import Values
 
 FULL = Netlist(
     "buck converter",
@@ -43,8 +45,34 @@ _T_STEP = schematic.N_BEFORE * schematic.PERIOD
 _T_END = (schematic.N_BEFORE + schematic.N_AFTER) * schematic.PERIOD
 
 
+def values_of(netlist: Netlist, x: np.ndarray) -> tuple[Values, np.ndarray]:
+    """Values of a netlist's elements at samples of all 22 transistors, and its transistors' sizes.
+
+    Args:
+        netlist: with some of `schematic.MOSFETS`, by name.
+        x: `[n, 44]` in sigma.
+    Returns:
+        (Values, `[2, m, n]`: width and length of each transistor over what is drawn).
+    """
+    u = np.asarray(x, np.float64).reshape(len(x), -1, 2).transpose(1, 2, 0)
+    names, mosfets = [m.name for m in schematic.MOSFETS], netlist.of(Mosfet)
+    u = u[[names.index(m.name) for m in mosfets]]
+    with jax.enable_x64(True):
+        values = schematic.variation(
+            compile_netlist(netlist, "level1"), tuple(mosfets), jnp.asarray(u)
+        )
+    (_, _, s_length), (_, _, s_width) = schematic.QUANTITIES
+    stretch = np.stack([1.0 + s_width * u[:, 1], 1.0 + s_length * u[:, 0]])
+    return jax.tree.map(np.asarray, values), stretch
+
+
 def dcdc_decks(
-    x: np.ndarray, *, model: str = "level1", max_step: float = 1e-9, reltol: float = 1e-4
+    x: np.ndarray,
+    *,
+    model: str = "level1",
+    max_step: float = 1e-9,
+    reltol: float = 1e-4,
+    loads: tuple[float, float] = (schematic.LOAD_HEAVY, schematic.LOAD_LIGHT),
 ) -> list[str]:
     """ngspice input files of samples `x [n, 44]` in sigma.
 
@@ -53,27 +81,18 @@ def dcdc_decks(
         model: "level1" (ngspice's own) or "ekv" (behavioural sources).
         max_step: largest time step [s].
         reltol: relative tolerance of ngspice.
+        loads: before and after the step [A].
     Returns:
         One text per sample; each prints `vmean` and `vpeak`.
     """
-    u = np.asarray(x, np.float64).reshape(len(x), -1, 2).transpose(1, 2, 0)
-    with jax.enable_x64(True):
-        values = schematic.variation(
-            compile_netlist(FULL, "level1"), schematic.MOSFETS, jnp.asarray(u)
-        )
-    values = jax.tree.map(np.asarray, values)
-    (_, _, s_length), (_, _, s_width) = schematic.QUANTITIES
-    load = (
-        (0.0, schematic.LOAD_HEAVY),
-        (_T_STEP, schematic.LOAD_HEAVY),
-        (_T_STEP + 1e-9, schematic.LOAD_LIGHT),
-        (1.0, schematic.LOAD_LIGHT),
-    )
+    values, stretch = values_of(FULL, x)
+    before, after = loads
+    load = ((0.0, before), (_T_STEP, before), (_T_STEP + 1e-9, after), (1.0, after))
     own = [
         f"Vramp ramp 0 PULSE({schematic.RAMP_LOW!r} {schematic.RAMP_HIGH!r} 0 "
         f"{schematic.RAMP_RISE!r} {schematic.RAMP_FALL!r} {schematic.RAMP_TOP!r} "
         f"{schematic.PERIOD!r})",
-        f"L1 sw lx {schematic.INDUCTANCE!r} ic=0.2",
+        f"L1 sw lx {schematic.INDUCTANCE!r} ic={before!r}",
     ]
     control = [
         f"tran {max_step!r} {_T_END!r} 0 {max_step!r} uic",
@@ -84,7 +103,7 @@ def dcdc_decks(
     ]
     return sample_decks(
         "BUCK", FULL, values, control,
-        stretch=np.stack([1.0 + s_width * u[:, 1], 1.0 + s_length * u[:, 0]]),
+        stretch=stretch,
         model=model,
         waves={"Iload": load},
         own=own,
@@ -100,6 +119,7 @@ def dcdc_reference(
     workers: int = 2,
     timeout: float = 300.0,
     max_step: float = 1e-9,
+    loads: tuple[float, float] = (schematic.LOAD_HEAVY, schematic.LOAD_LIGHT),
 ) -> tuple[np.ndarray, np.ndarray]:
     """Specifications of samples by ngspice, every transistor in every period.
 
@@ -109,12 +129,13 @@ def dcdc_reference(
         workers: processes at a time.
         timeout: limit of each [s].
         max_step: largest time step [s].
+        loads: before and after the step [A].
     Returns:
         (specs `[n, 2]` as `converter.SPECS`, status `[n]`).
     Raises:
         NgspiceError: not installed.
     """
-    decks = dcdc_decks(x, model=model, max_step=max_step)
+    decks = dcdc_decks(x, model=model, max_step=max_step, loads=loads)
     numbers, status = ngspice.run_many(decks, ("vmean", "vpeak"), workers=workers, timeout=timeout)
     mean, peak = numbers.T
     return np.stack([np.abs(mean - schematic.V_REF), peak - schematic.V_REF], axis=1), status

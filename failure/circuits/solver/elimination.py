@@ -16,19 +16,23 @@ def add_entry(entries: Entries, i: int, j: int, value: Array) -> None:
     entries[i, j] = entries[i, j] + value if (i, j) in entries else value
 
 
-def full_matrix(system: System, entries: Entries, batch: int) -> Float[Array, "n n b"]:
+def full_matrix(
+    system: System, entries: Entries | Float[Array, "n n b"], batch: int
+) -> Float[Array, "n n b"]:
     """The matrix with its zeros."""
+    if not isinstance(entries, dict):
+        return entries
     zero = jnp.zeros((batch,), next(iter(entries.values())).dtype)
     rows = [entries.get((i, j), zero) for i in range(system.n) for j in range(system.n)]
     return jnp.stack(rows).reshape(system.n, system.n, batch)
 
 
 def eliminate_full(
-    system: System, entries: Entries, rhs: Float[Array, "n b"]
+    system: System, matrix: Float[Array, "n n b"], rhs: Float[Array, "n b"]
 ) -> Float[Array, "n b"]:
     """The same as `eliminate` on the full matrix, row by row: a short program."""
     order = np.asarray(system.order)
-    a, b = full_matrix(system, entries, rhs.shape[-1])[order][:, order], rhs[order]
+    a, b = matrix[order][:, order], rhs[order]
     rows: list[tuple[Array, Array, Array]] = []
     for _ in range(system.n):
         inverse = 1.0 / a[0, 0]
@@ -41,19 +45,21 @@ def eliminate_full(
     return x[np.argsort(order)]
 
 
-def eliminate(system: System, entries: Entries, rhs: Float[Array, "n b"]) -> Float[Array, "n b"]:
+def eliminate(
+    system: System, entries: Entries | Float[Array, "n n b"], rhs: Float[Array, "n b"]
+) -> Float[Array, "n b"]:
     """Solve the sparse system for one right-hand side, batch last, without pivoting.
 
     Args:
         system: gives the order.
-        entries: `(i, j) -> [b]`.
+        entries: `(i, j) -> [b]`, or the matrix.
         rhs: right-hand sides.
     Returns:
         Solution `[n, b]`.
     Deviation: LU with partial pivoting is safer; nodal matrices with gmin on the diagonal do not
         need it here, and a small pivot shows up as a sample that does not converge.
     """
-    if system.dense:
+    if not isinstance(entries, dict):
         return eliminate_full(system, entries, rhs)
     a = dict(entries)
     b = [rhs[i] for i in range(system.n)]

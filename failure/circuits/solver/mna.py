@@ -1,7 +1,7 @@
 """Modified nodal analysis: the batched residual of a compiled netlist and its sparse Jacobian.
 
 The batch is the last axis of every array. The Jacobian is a dictionary of its structurally nonzero
-entries, each `[batch]`.
+entries, each `[batch]`; of a dense system (`System.dense`) it is one array, by `incidence`.
 """
 
 from __future__ import annotations
@@ -13,6 +13,7 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
+from failure.circuits.solver import incidence
 from failure.circuits.solver.elimination import Entries, add_entry
 from failure.circuits.solver.mosfet import MosParams, drain_current
 from failure.circuits.solver.netlist import (
@@ -35,10 +36,11 @@ GMIN = 1e-12
 class Stamps(NamedTuple):
     """The part of the equations that Newton does not change; the batch is last.
 
-    `linear` holds the entries `(i, j)` of `keys`, `const` the constant current of each row.
+    `linear` holds the entries `(i, j)` of `keys`, of a dense system the matrix `[n, n, b]`; `const`
+    the constant current of each row.
     """
 
-    linear: Float[Array, "nnz b"]
+    linear: Float[Array, "... b"]
     const: Float[Array, "n b"]
     known: Float[Array, "k b"]
     mos: MosParams
@@ -117,8 +119,11 @@ def stamps(system: System, values: Values) -> Stamps:
         Stamps.
     """
     batch = batch_size(values)
-    entries, const = conductance(system, values)
     known = known_voltages(system, values, batch)
+    if system.dense:
+        matrix, constant = incidence.conductance(system, values, GMIN)
+        return assemble_full(system, values, matrix, constant, known)
+    entries, const = conductance(system, values)
     return assemble(system, values, entries, const, known, batch)
 
 
@@ -140,9 +145,23 @@ def assemble(
     return Stamps(jnp.stack(linear), jnp.stack(rows), known, values.mos, values.load)
 
 
+def assemble_full(
+    system: System,
+    values: Values,
+    matrix: Float[Array, "n m #b"],
+    const: Float[Array, "n #b"],
+    known: Float[Array, "k b"],
+) -> Stamps:
+    """`assemble` of a dense system."""
+    n = system.n
+    fixed = const + jnp.sum(matrix[:, n:] * known[None], axis=1)
+    linear = matrix[:, :n] + jnp.zeros_like(fixed[:, None])
+    return Stamps(linear, fixed, known, values.mos, values.load)
+
+
 def residual(
     system: System, s: Stamps, v: Float[Array, "n b"]
-) -> tuple[Float[Array, "n b"], Entries]:
+) -> tuple[Float[Array, "n b"], Entries | Float[Array, "n n b"]]:
     """Sum of the currents that leave each node, and its Jacobian.
 
     Args:
@@ -150,9 +169,13 @@ def residual(
         s: Stamps.
         v: unknowns.
     Returns:
-        (F `[n, b]`, entries `(i, j) -> [b]`).
+        (F `[n, b]`, entries `(i, j) -> [b]`, of a dense system the matrix).
     """
     full = jnp.concatenate([v, s.known])
+    if system.dense:
+        device = incidence.devices(system, s.mos, s.load, full)
+        linear = jnp.sum(s.linear * v[None], axis=1)
+        return s.const + linear + device.current, s.linear + device.slope
     rows = [s.const[i] for i in range(system.n)]
     entries: Entries = {}
     for k, (i, j) in enumerate(keys(system)):

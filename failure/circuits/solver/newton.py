@@ -102,7 +102,10 @@ def newton(
     if len(stages.gmin) == 1:
         return solve(v0, s)
 
-    diagonal = np.array([i == j and i < nodes for i, j in keys(system)])[:, None]
+    if system.dense:
+        diagonal = np.diag(np.arange(system.n) < nodes)[:, :, None]
+    else:
+        diagonal = np.array([i == j and i < nodes for i, j in keys(system)])[:, None]
     gmins, scales = (jnp.asarray(a, v0.dtype) for a in (stages.gmin, stages.scale))
     restarts, ends = jnp.asarray(stages.restart), jnp.asarray(stages.end)
 

@@ -9,7 +9,15 @@ import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
 
-from failure.circuits.solver.mna import assemble, capacitance, conductance, known_voltages
+from failure.circuits.solver import incidence
+from failure.circuits.solver.mna import (
+    GMIN,
+    assemble,
+    assemble_full,
+    capacitance,
+    conductance,
+    known_voltages,
+)
 from failure.circuits.solver.netlist import CurrentSource, Inductor, Load, Switch, VoltageSource
 from failure.circuits.solver.newton import (
     MAX_STEP,
@@ -115,7 +123,8 @@ def transient(
     rows = [system.index(p) for p in probes]
     batch = batch_size(values)
     dtype = start.v.dtype
-    cap = capacitance(system, values)
+    cap = {} if system.dense else capacitance(system, values)
+    cap_full = incidence.capacitance(system, values) if system.dense else None
     cap_rows = [i for i, _ in cap]
     inductors = [
         (system.index(f"{e.name}#branch"), e, k) for k, e in enumerate(system.netlist.of(Inductor))
@@ -134,6 +143,8 @@ def transient(
         return changed
 
     def charge(full: Array) -> Array:
+        if cap_full is not None:
+            return jnp.sum(cap_full * full[None], axis=1)
         total = [jnp.zeros((batch,), dtype) for _ in range(system.n)]
         for (i, j), c in cap.items():
             total[i] = total[i] + c * full[j]
@@ -143,23 +154,34 @@ def transient(
         v, slope, known_old, q_old, i_old, status = carry
         now, alpha, beta, ratio = xs
         here = at(now)
-        entries, const = conductance(system, here)
-        entries = dict(entries)
         known = known_voltages(system, here, batch)
-        for key, c in cap.items():
-            entries[key] = entries[key] + alpha * c if key in entries else alpha * c
-        const = dict(const)
-        zero = jnp.zeros((batch,), dtype)
-        for i in set(cap_rows):
-            const[i] = const.get(i, zero) - alpha * q_old[i] - beta * i_old[i]
         full_old = jnp.concatenate([v, known_old])
-        for row, e, k in inductors:
+
+        def coil(e: Inductor, k: int, row: int) -> tuple[Array, Array]:
             # Row: v_p - v_n = L di/dt, with the same rule as the capacitors.
             drop = full_old[system.index(e.p)] - full_old[system.index(e.n)]
             henries = values.henries[k]
-            entries[row, row] = -alpha * henries
-            const[row] = alpha * henries * v[row] + beta * drop
-        s = assemble(system, here, entries, const, known, batch)
+            return -alpha * henries, alpha * henries * v[row] + beta * drop
+
+        if cap_full is not None:
+            matrix, constant = incidence.conductance(system, here, GMIN)
+            matrix = matrix + alpha * cap_full
+            constant = constant - alpha * q_old - beta * i_old
+            for row, e, k in inductors:
+                own, past = coil(e, k, row)
+                matrix = matrix.at[row, row].set(own)
+                constant = constant.at[row].set(past)
+            s = assemble_full(system, here, matrix, constant, known)
+        else:
+            entries, const = conductance(system, here)
+            for key, c in cap.items():
+                entries[key] = entries[key] + alpha * c if key in entries else alpha * c
+            zero = jnp.zeros((batch,), dtype)
+            for i in set(cap_rows):
+                const[i] = const.get(i, zero) - alpha * q_old[i] - beta * i_old[i]
+            for row, e, k in inductors:
+                entries[row, row], const[row] = coil(e, k, row)
+            s = assemble(system, here, entries, const, known, batch)
         # No farther than one Newton step may go: ringing would be extrapolated out of the supplies.
         guess = v + jnp.clip(slope * ratio, -MAX_STEP, MAX_STEP)
         new, last = newton(system, max_iterations, PLAIN, s, jax.lax.stop_gradient(guess))

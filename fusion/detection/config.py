@@ -38,6 +38,7 @@ class DenseConfig:
         heights: above ground at which a cell samples the camera's map [m].
         heat_sd, radius: deviation of the heat around a car's centre, and how near to it cells tell
             its box [m].
+        overlap_weight: of the loss by overlap of boxes beside that of their numbers.
         nms, candidates: rotated overlap limit between detections, and of how many.
     """
 
@@ -48,6 +49,7 @@ class DenseConfig:
     heights: tuple[float, ...] = (0.4, 1.0, 1.6)
     heat_sd: float = 0.45
     radius: float = 0.9
+    overlap_weight: float = 2.0
     nms: float = 0.1
     candidates: int = 64
 
@@ -59,6 +61,8 @@ class DenseConfig:
         for name in ("cell", "heat_sd", "radius"):
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name}={getattr(self, name)}: expected a length above 0 [m]")
+        if not 0 <= self.overlap_weight < float("inf"):
+            raise ValueError(f"overlap_weight={self.overlap_weight}: expected a number >= 0")
         if not self.heights or not 0 <= self.nms <= 1 or self.candidates < 1:
             raise ValueError(
                 f"heights={self.heights}, nms={self.nms}, candidates={self.candidates}: expected "

@@ -8,8 +8,9 @@
 
 trains every model on the same frames with the same failures (one sensor fails in two thirds of
 them), measures 3D moderate R40 with all sensors working and in every cell of failure and severity,
-and writes `results/study_robustness.json` (`_val` is added to tables of the validation frames, on
-which settings are chosen) and the paired differences to `dense` beside it.
+and writes `results/study_robustness.json` (`_val` is added to tables of validation frames, on
+which settings are chosen), with paired differences of clean frames and means seed by seed, p values
+corrected over all of them.
 
 `dense_oracle` is told which sensor fails and how severely: no gate of this network can know more.
 `camera_only` and `lidar_only` are the trained `dense` with the fusion weights fixed at (1, 0) and
@@ -39,7 +40,7 @@ from snn_fusion_failure.commands.detector_cells import (
     read_frames,
 )
 from snn_fusion_failure.commands.detector_robustness import summarize_cells
-from snn_fusion_failure.records.rows import record_comparisons, record_table, summarize
+from snn_fusion_failure.records.rows import Compared, column_cells, record_table
 from snn_fusion_failure.runs import print_result, repository, run_command
 
 MODELS: tuple[choices.Model, ...] = (
@@ -56,6 +57,14 @@ FOLDS = (
 """Kinds that are left out of the training together; each group has both sensors."""
 Fold = Literal["none", "0", "1", "2", "seed"]
 METRICS = (METRIC, "weight_auroc", "failed_auroc")
+GROUPS = (
+    "clean", "seen kinds", "misaligned", "clean (folds)", "seen kinds (folds)", "unseen kinds",
+)  # fmt: skip
+"""Rows that are compared seed by seed; single cells are too many to tell anything of each."""
+PAIRS = (
+    ("dense_argate", "dense"), ("dense_oracle", "dense"), ("dense_oracle", "dense_argate"),
+    ("dense", "lidar_only"), ("avod_argate", "avod"),
+)  # fmt: skip
 
 
 @dataclasses.dataclass(frozen=True)
@@ -262,43 +271,27 @@ def scores(config: Config) -> dict[tuple[str, str], dict[int, dict[str, float]]]
     }
 
 
-def collect(config: Config) -> tuple[list[dict[str, Any]], list[dict[str, Any]]]:
-    """Rows of the table of record, and paired differences of 3D moderate of the means."""
-    from snn_fusion_failure.records.statistics import paired_test
-
-    held = scores(config)
-    rows, pairs = [], []
-    for (row, model), by_seed in held.items():
-        for metric in (*METRICS, "mra", "mce"):
-            values = [v[metric] for v in by_seed.values() if metric in v]
-            if values and len(values) == len(by_seed):
-                unit = "%" if metric == METRIC else "1"
-                cell = {"row": row, "model": model, "metric": metric, "unit": unit}
-                rows.append(cell | {"split": config.split} | summarize(values))
-        other = "avod" if model == "avod_argate" else BASELINE
-        base = held.get((row, other), {})
-        shared = sorted(base.keys() & by_seed.keys())
-        if (
-            row.startswith(("clean", "seen", "unseen", "misaligned"))
-            and model != BASELINE
-            and len(shared) > 1
-        ):
-            a, b = ([scores[s][METRIC] for s in shared] for scores in (by_seed, base))
-            comparison = {"row": row, "comparison": f"{model} - {other}", "metric": METRIC}
-            pairs.append(comparison | paired_test(a, b)._asdict())
-    return rows, pairs
+def collect(config: Config) -> list[dict[str, Any]]:
+    """Rows of the table of record."""
+    units = dict.fromkeys((*METRICS, "mra", "mce"), "1") | {METRIC: "%"}
+    return [
+        {"row": row, "model": model, "split": config.split} | cell
+        for (row, model), by_seed in scores(config).items()
+        for cell in column_cells(by_seed, units)
+    ]
 
 
 def main(config: Config) -> dict[str, Any]:
     """Do the trainings and cells that are missing, then write the tables."""
     done = 0 if config.collect_only else execute(config)
-    rows, pairs = collect(config)
+    rows = collect(config)
     table = config.name if config.split == "test" else f"{config.name}_val"
     if rows:
         title = f"Car detection by sensor failure and severity ({config.split} frames)"
-        record_table(config.results / f"{table}.json", table, title, rows, preset=config.size)
-        if pairs:
-            record_comparisons(config.results, table, title, pairs, preset=config.size)
+        record_table(
+            config.results / f"{table}.json", table, title, rows, preset=config.size,
+            compared=[Compared(METRIC, PAIRS, rows=GROUPS)],
+        )  # fmt: skip
     fields = {
         f"{row['model']}_{row['row'].replace(' ', '_')}": row["mean"]
         for row in rows

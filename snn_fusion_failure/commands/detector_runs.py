@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -121,11 +122,20 @@ def check_settings(folder: Path, setup: Any) -> None:
         return
     held = json.loads(path.read_text(encoding="utf-8")).get("settings", {})
     for part, now in resolved(setup).items():
-        before = held.get(part, {})
-        # A setting that is new since then has its default, which changes nothing.
+        for key, old, new in _differences(held.get(part, {}), now):
+            raise ValueError(
+                f"{folder} was trained with {key}={old}, not {new}: give the settings of the run, "
+                "or train in another folder (--name, --out)"
+            )
+
+
+def _differences(before: Any, now: Any, name: str = "") -> Iterator[tuple[str, Any, Any]]:
+    """Name, old and new value of the settings that both have and that differ.
+
+    A setting that is new since then has its default, which changes nothing.
+    """
+    if isinstance(before, dict) and isinstance(now, dict):
         for key in sorted(now.keys() & before.keys()):
-            if now[key] != before[key]:
-                raise ValueError(
-                    f"{folder} was trained with {key}={before[key]}, not {now[key]}: give the "
-                    "settings of the run, or train in another folder (--name, --out)"
-                )
+            yield from _differences(before[key], now[key], f"{name}.{key}" if name else key)
+    elif before != now:
+        yield name, before, now

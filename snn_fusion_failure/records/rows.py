@@ -21,6 +21,8 @@ class Compared(NamedTuple):
     """(column, column that is taken from it)."""
     factor: float = 1.0
     """What makes points of the metric."""
+    rows: tuple[str, ...] = ()
+    """Only these rows; all when left out."""
 
 
 def summarize(values: Sequence[float]) -> dict[str, Any]:
@@ -74,9 +76,9 @@ def compare_columns(
     for cell in rows:
         held.setdefault(cell["metric"], {})[cell["row"], cell["model"]] = values_by_seed(cell)
     found = []
-    for place, (metric, pairs, factor) in enumerate(compared):
+    for place, (metric, pairs, factor, only) in enumerate(compared):
         columns = held.get(metric, {})
-        for row in dict.fromkeys(name for name, _ in columns):
+        for row in dict.fromkeys(name for name, _ in columns if not only or name in only):
             case = f"{row}, {metric.replace('_', ' ')}" if place else row
             for one, other in pairs:
                 a, b = columns.get((row, one), {}), columns.get((row, other), {})

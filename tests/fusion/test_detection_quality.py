@@ -99,6 +99,23 @@ def test_maps_of_a_failing_lidar_are_told(kind: str) -> None:
     assert told(clean, failed) > 0.95
 
 
+def test_what_tells_noisy_ranges_and_blur_moves_as_far_as_other_statistics_do() -> None:
+    # Noisy ranges: beside 196 solid cells 6 stand alone, then 24, as many times as of real scans.
+    bev = np.zeros((2, *BEV.shape, 6), np.float32)
+    for frame, alone in enumerate((6, 24)):
+        place = np.arange(alone)
+        bev[frame, 1 + 2 * (place % 24), 1 + 2 * (place // 24), -1] = 0.5
+        bev[frame, :49, 10:14, -1] = 0.5
+    shift = np.diff(np.asarray(scan_statistics(BEV, jnp.asarray(bev))), axis=0)[0]
+    assert shift[15] > 0.5 and np.sort(shift)[-2] < 0.1
+    # Blur: neighbouring pixels alike, at the same contrast of the blocks.
+    rng = np.random.default_rng(0)
+    sharp = pictures(rng)[:1] - 0.37
+    blurred = (np.roll(sharp, 1, axis=2) + sharp + np.roll(sharp, -1, axis=2)) / 3.0
+    found = np.asarray(image_statistics(jnp.asarray(np.concatenate([sharp, blurred]))))
+    assert found[0, 10] - found[1, 10] > 0.5
+
+
 def test_statistics_pass_no_gradient_and_labels_count_where_they_are_known() -> None:
     image, bev = jnp.ones((2, 32, 96, 3)), jnp.ones((2, *BEV.shape, 6))
     slope = jax.grad(lambda x: quality_statistics(BEV, x, bev).sum())(image)

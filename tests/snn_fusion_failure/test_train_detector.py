@@ -222,7 +222,7 @@ def test_runs_of_other_settings_are_not_mixed(root: Path, tmp_path: Path) -> Non
     runs.check_settings(tmp_path, setup)
     for changed, name in (
         (dataclasses.replace(options, steps=5), "steps=4, not 5"),
-        (dataclasses.replace(options, changes=("params.gate.tau=0.7",)), "gate_params="),
+        (dataclasses.replace(options, changes=("params.gate.tau=0.7",)), "gate_params.tau="),
         (dataclasses.replace(options, changes=("detector.path_drop=0.3",)), "path_drop="),
     ):
         with pytest.raises(ValueError, match=f"was trained with {name}"):
@@ -238,6 +238,10 @@ def test_runs_of_other_settings_are_not_mixed(root: Path, tmp_path: Path) -> Non
             tmp_path,
             runs.build(dataclasses.replace(plain, changes=("detector.path_drop=0.3",)), cache),
         )
+    # A setting that is new since the run, at any depth, has its default.
+    del held["settings"]["detector"]["bev"]["density_points"]
+    (tmp_path / "result.json").write_text(json.dumps(held))
+    runs.check_settings(tmp_path, runs.build(plain, cache))
     (tmp_path / "result.json").write_text("{}")  # from before settings were written
     runs.check_settings(tmp_path, setup)
 

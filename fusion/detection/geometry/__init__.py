@@ -27,6 +27,7 @@ from fusion.detection.geometry.encodings import (
     project_boxes,
     resolve_heading,
 )
+from fusion.detection.geometry.inside import points_in_boxes
 from fusion.detection.geometry.overlaps import (
     box3d_iou,
     ground_iou,
@@ -73,6 +74,7 @@ __all__ = [
     "pairwise",
     "plane_difference",
     "plane_y",
+    "points_in_boxes",
     "project_boxes",
     "resolve_heading",
     "rotated_intersection",

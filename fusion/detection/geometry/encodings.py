@@ -13,6 +13,8 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from fusion.detection.geometry.planes import plane_y
+
 Box3D = Float[Array, "n 7"]
 Anchor = Float[Array, "n 6"]
 
@@ -78,10 +80,6 @@ def decode_offsets(anchors: Anchor, offsets: Float[Array, "n 6"]) -> Anchor:
     )
 
 
-def _ground_y(plane: Float[Array, "4"], x: Array, z: Array) -> Array:
-    return -(plane[0] * x + plane[2] * z + plane[3]) / plane[1]
-
-
 def box3d_to_box4c(boxes: Box3D, plane: Float[Array, "4"]) -> Float[Array, "n 10"]:
     """Four corners and two heights: x1..x4, z1..z4, h1, h2.
 
@@ -99,7 +97,7 @@ def box3d_to_box4c(boxes: Box3D, plane: Float[Array, "4"]) -> Float[Array, "n 10
     turn = yaw - jnp.round(yaw / (jnp.pi / 2)) * (jnp.pi / 2)
     upright = jnp.stack([x, y, z, anchor[:, 3], anchor[:, 5], height, turn], axis=1)
     corners = box_corners(upright)[:, :4]
-    h1 = _ground_y(plane, x, z) - y
+    h1 = plane_y(plane, x, z) - y
     heights = jnp.stack([h1, h1 + height], axis=1)
     return jnp.concatenate([corners[:, :, 0], corners[:, :, 2], heights], axis=1)
 
@@ -140,7 +138,7 @@ def box4c_to_box3d(boxes: Float[Array, "n 10"], plane: Float[Array, "4"]) -> Box
     centre = origin + along * (0.5 * (low_l + high_l))[:, None]
     x, z = centre[:, 0], centre[:, 1]
     h1, h2 = boxes[:, 8], boxes[:, 9]
-    y = _ground_y(plane, x, z) - h1
+    y = plane_y(plane, x, z) - h1
     yaw = -jnp.arctan2(heading[:, 1], heading[:, 0])
     return jnp.stack([x, y, z, high_l - low_l, width, h2 - h1, yaw], axis=1)
 

@@ -13,7 +13,7 @@ score. Ku et al. (2018) use given planes; the search limits here are our choice,
 from __future__ import annotations
 
 import dataclasses
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import numpy as np
 from jaxtyping import Float
@@ -73,10 +73,8 @@ def height_above(
     return points @ plane[:3] + plane[3]
 
 
-def plane_y(
-    plane: Float[np.ndarray, "4"], x: Float[np.ndarray, "n"], z: Float[np.ndarray, "n"]
-) -> Float[np.ndarray, "n"]:
-    """The camera-frame y of the ground at (x, z)."""
+def plane_y(plane: Float[Any, "4"], x: Float[Any, "*n"], z: Float[Any, "*n"]) -> Float[Any, "*n"]:
+    """The camera-frame y of the ground at (x, z), in numpy or inside jit."""
     return -(plane[0] * x + plane[2] * z + plane[3]) / plane[1]
 
 

@@ -1,6 +1,7 @@
 """Examples, losses, training, detection and scoring."""
 
 from fusion.detection.learning.augmentation import flip, in_area, turn_and_scale
+from fusion.detection.learning.box_overlap import box_overlaps, overlap_loss
 from fusion.detection.learning.cache import (
     TESTING,
     Cache,
@@ -54,6 +55,7 @@ from fusion.detection.learning.inference import detect, to_objects
 from fusion.detection.learning.interrupts import interrupt_between_steps
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
 from fusion.detection.learning.params import DetectorParams
+from fusion.detection.learning.pasting import paste_objects
 from fusion.detection.learning.sampling import Assignment, Sample, assign, draw
 from fusion.detection.learning.scoring import (
     Camera,
@@ -96,6 +98,7 @@ __all__ = [
     "assign",
     "average_cells",
     "balanced_class_loss",
+    "box_overlaps",
     "class_loss",
     "class_losses",
     "class_precision",
@@ -126,6 +129,8 @@ __all__ = [
     "make_example",
     "make_inputs",
     "open_cache",
+    "overlap_loss",
+    "paste_objects",
     "path_losses",
     "precision_fields",
     "prepare_cache",

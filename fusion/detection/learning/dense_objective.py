@@ -1,12 +1,13 @@
 r"""What training of the one-stage detector minimizes, and its detections.
 
 .. math::
-    L = L_{heat} + \rho \, L_{box} + \alpha \sum_k w_k L^{aux}_k
+    L = L_{heat} + \rho \, L_{box} + \eta \, L_{o} + \alpha \sum_k w_k L^{aux}_k
       + \beta \sum_k \big(w_k - f_k(L^{aux})\big)^2 + \dots
 
 The heat has a focal loss over all cells but the ignored ones (vans, DontCare regions), divided by
 the number of cars; the box an absolute error
-over the cells near one: a hit needs boxes right to a decimetre, where a smooth L1 hardly pulls.
+over the cells near one: a hit needs boxes right to a decimetre, where a smooth L1 hardly pulls;
+:math:`L_o` is what lacks to a full overlap there (`box_overlap`).
 :math:`L^{aux}_k` is the same of a head that reads view k alone; the gate's terms are those of
 `gate_objective`.
 
@@ -15,6 +16,7 @@ Source: Zhou, Wang, Kraehenbuehl (2019), Eq. 1; Shim (2020), Eq. 3.2.
 
 from __future__ import annotations
 
+from functools import partial
 from typing import Any
 
 import jax
@@ -24,6 +26,7 @@ from jaxtyping import Array, Bool, Float, PRNGKeyArray
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import ground_box
 from fusion.detection.geometry.suppression import nms
+from fusion.detection.learning.box_overlap import overlap_loss
 from fusion.detection.learning.dense_targets import (
     GridTargets,
     average_cells,
@@ -88,6 +91,7 @@ def dense_loss(
     outputs = model.apply(main, grids, 2.0 * grids.weights * kept, method="head")
     targets = jax.vmap(lambda frame: grid_targets(config, frame))(inputs)
     heat, boxes, _ = grid_losses(outputs, targets)
+    lacks = jax.vmap(partial(overlap_loss, config))(outputs[..., 1:], targets, inputs.plane)
     gate = of_paths = regularization = jnp.zeros(())
     if config.gated:
         heads: Any = DenseAuxiliary(config)
@@ -101,7 +105,8 @@ def dense_loss(
             config, hyper.gate, params, grids.weights, [paths]
         )
     failure = failure_loss(grids.failed, failed)
-    total = (heat + config.regression_weight * boxes).mean() + gate
+    boxes = config.regression_weight * boxes + config.dense.overlap_weight * lacks
+    total = (heat + boxes).mean() + gate
     total = total + hyper.failure_label * failure
     zero = jnp.zeros(())
     terms = DetectorLoss(

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import wrap_angle
+from fusion.detection.geometry.planes import plane_y
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.lifting import grid_centres
 
@@ -54,10 +55,6 @@ def _mean_size(config: DetectorConfig) -> np.ndarray:
     return np.mean(np.asarray(config.anchors.sizes, np.float32), axis=0)
 
 
-def _ground(plane: Array, x: Array, z: Array) -> Array:
-    return -(plane[0] * x + plane[2] * z + plane[3]) / plane[1]
-
-
 def _inside_boxes(boxes: Array, mask: Array, x: Array, z: Array) -> Array:
     """Which cells' centres lie in the footprint of a box, half a metre around it included."""
     dx, dz = (a[None] - boxes[:, i, None, None] for a, i in ((x, 0), (z, 2)))
@@ -72,7 +69,7 @@ def _inside_regions(
     regions: Float[Array, "d 4"], plane: Array, p2: Float[Array, "3 4"], x: Array, z: Array
 ) -> Array:
     """Which cells are seen in a DontCare region, at the height of a car's middle."""
-    points = jnp.stack([x, _ground(plane, x, z) - _MIDDLE, z, jnp.ones_like(x)], axis=-1)
+    points = jnp.stack([x, plane_y(plane, x, z) - _MIDDLE, z, jnp.ones_like(x)], axis=-1)
     seen = points @ p2.T
     u, v = (seen[..., i] / jnp.maximum(seen[..., 2], 0.1) for i in (0, 1))
     left, top, right, bottom = (regions[:, i, None, None] for i in range(4))
@@ -103,7 +100,7 @@ def grid_targets(config: DetectorConfig, inputs: Inputs) -> GridTargets:
     flat = jnp.where(mask, row * x.shape[1] + column, x.size)
     centre = jnp.zeros(x.size, bool).at[flat].set(True, mode="drop").reshape(x.shape)
     nearest = truth[square.argmin(axis=0)]
-    raised = nearest[..., 1] - _ground(plane, nearest[..., 0], nearest[..., 2])
+    raised = nearest[..., 1] - plane_y(plane, nearest[..., 0], nearest[..., 2])
     size = jnp.maximum(nearest[..., 3:6], 0.1) / jnp.asarray(_mean_size(config))[None, None]
     heading = nearest[..., 6]
     angles = [jnp.cos(2.0 * heading), jnp.sin(2.0 * heading), jnp.cos(heading), jnp.sin(heading)]
@@ -153,10 +150,12 @@ def decode_cells(
     """3D boxes that the cells tell, in the order of the flattened grid."""
     x, z = (jnp.asarray(a) for a in grid_centres(config))
     at_x, at_z = x + boxes[..., 0], z + boxes[..., 1]
-    y = _ground(plane, at_x, at_z) + 0.5 * boxes[..., 2]
+    y = plane_y(plane, at_x, at_z) + 0.5 * boxes[..., 2]
     log_size = jnp.clip(0.5 * boxes[..., 3:6], -_LOG_LIMIT, _LOG_LIMIT)
     size = jnp.asarray(_mean_size(config))[None, None] * jnp.exp(log_size)
-    axis = 0.5 * jnp.arctan2(boxes[..., 7], boxes[..., 6])
+    # Features that are all zero tell no axis, and the angle of (0, 0) has no gradient.
+    untold = (boxes[..., 6] == 0.0) & (boxes[..., 7] == 0.0)
+    axis = 0.5 * jnp.arctan2(boxes[..., 7], jnp.where(untold, 1e-3, boxes[..., 6]))
     ahead = jnp.cos(axis) * boxes[..., 8] + jnp.sin(axis) * boxes[..., 9] >= 0.0
     heading = wrap_angle(jnp.where(ahead, axis, axis + jnp.pi))
     return jnp.concatenate(

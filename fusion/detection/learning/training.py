@@ -19,6 +19,7 @@ from fusion.detection.learning.dense_objective import dense_loss
 from fusion.detection.learning.examples import Example, frame_depth, make_inputs
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
 from fusion.detection.learning.params import DetectorParams
+from fusion.detection.learning.pasting import paste_objects
 from fusion.detection.network.build import init_detector
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.sensors.camera_failures import (
@@ -54,6 +55,8 @@ class DetectorTrainConfig:
         flip: mirror half of the frames; colour_sd: shift of the colour channels.
         rotation: largest angle that the scene is turned by [degree]; scaling: largest change of its
             size as a share; both drawn evenly, see `turn_and_scale`.
+        pasting: share of another frame's objects of the batch that are pasted into each frame
+            where there is room, see `paste_objects`.
         failure_share: frames in which one sensor fails (half camera, half lidar); the source keeps
             a third clean in its other experiments.
         severity: least severity of these failures; drawn evenly up to 1.
@@ -74,6 +77,7 @@ class DetectorTrainConfig:
     colour_sd: float = 0.02
     rotation: float = 0.0
     scaling: float = 0.0
+    pasting: float = 0.0
     failure_share: float = 0.0
     severity: float = 0.5
     failure_kinds: tuple[str, ...] = SENSOR_FAILURES
@@ -92,6 +96,13 @@ class DetectorTrainConfig:
             raise ValueError(
                 f"rotation={self.rotation}, scaling={self.scaling}: expected an angle up to 45 "
                 "degrees and a share below 0.5"
+            )
+        if not 0 <= self.pasting <= 1:
+            raise ValueError(f"pasting={self.pasting}: expected a share in [0, 1]")
+        if self.pasting and self.batch_size < 2:
+            raise ValueError(
+                f"pasting={self.pasting}, batch_size={self.batch_size}: expected at least 2 frames "
+                "a step, whose objects are pasted into each other"
             )
         if not (0 <= self.failure_share <= 1 and 0 < self.severity <= 1):
             raise ValueError(
@@ -282,6 +293,11 @@ def train_step(
     """
     input_key, loss_key = jax.random.split(key)
     keys = jax.random.split(input_key, batch.image.shape[0])
+    if train.pasting:
+        others = jax.tree.map(lambda a: jnp.roll(jnp.asarray(a), 1, axis=0), batch)
+        batch = jax.vmap(lambda k, e, o: paste_objects(e, o, train.pasting, key=k))(
+            jax.random.split(jax.random.fold_in(input_key, 1), len(keys)), batch, others
+        )
     # One frame after the other: under vmap every kind of failure would be computed each time.
     inputs, failed = jax.lax.map(
         lambda a: training_inputs(config, train, a[1], key=a[0]), (keys, batch)

@@ -28,6 +28,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
+from fusion.detection.geometry.inside import points_in_boxes
 from fusion.detection.sensors.severity import Severity, check_failure
 
 Misalignment = Literal["calibration_shift", "time_lag"]
@@ -62,17 +63,6 @@ def _calibration_shift(
     return camera @ rotation.T + (SHIFT * s * _direction(by_shift))[None]
 
 
-def _own_car(camera: Array, truth: Array) -> Array:
-    """`[p, g]`: which points lie in or near which box."""
-    away = camera[:, None] - truth[None, :, :3]
-    c, s = jnp.cos(truth[:, 6])[None], jnp.sin(truth[:, 6])[None]
-    along = c * away[..., 0] - s * away[..., 2]
-    across = s * away[..., 0] + c * away[..., 2]
-    half = 0.5 * truth[:, 3:5] + _MARGIN
-    inside = (jnp.abs(along) < half[None, :, 0]) & (jnp.abs(across) < half[None, :, 1])
-    return inside & (away[..., 1] < _MARGIN) & (away[..., 1] > -truth[None, :, 5] - _MARGIN)
-
-
 def _time_lag(key: PRNGKeyArray, camera: Array, truth: Array, truth_mask: Array, s: Array) -> Array:
     by_sign, by_speed, by_turn, by_cars, by_parked = jax.random.split(key, 5)
     lag = LAG * s * jnp.where(jax.random.bernoulli(by_sign), 1.0, -1.0)
@@ -83,7 +73,7 @@ def _time_lag(key: PRNGKeyArray, camera: Array, truth: Array, truth_mask: Array,
         [jnp.cos(truth[:, 6]), jnp.zeros(n, truth.dtype), -jnp.sin(truth[:, 6])], axis=1
     )
     # Where each car was (lag > 0), in the frame of the picture's time ...
-    inside = _own_car(camera, truth) & truth_mask[None]
+    inside = points_in_boxes(camera, truth, margin=_MARGIN) & truth_mask[None]
     moved = jnp.where(inside, 1.0, 0.0) @ (speed[:, None] * heading)
     camera = camera - lag * moved
     # ... as seen from where the own car was then: it stood that much farther back.

@@ -2,8 +2,8 @@ r"""Plain statistics of the raw readings, from which a gate can tell that a sens
 
 Feature maps after normalization no longer hold what a failure changes most: level, contrast, the
 number of points. These are some fifty numbers of the picture and of the map, all of the order of 1:
-means and deviations, gradients, a histogram and its entropy, contrast of blocks; occupied cells by
-bearing and by depth, isolated ones, mean height and density.
+means and deviations, gradients and roughness, a histogram and its entropy, contrast of blocks;
+occupied cells by bearing and by depth, isolated ones, mean height and density.
 
 Source: statistics of natural scenes as measures of quality, Mittal, Moorthy, Bovik (2012); which of
 them is our choice.
@@ -21,13 +21,19 @@ from fusion.detection.geometry.bev import BevConfig
 _LEVELS = np.linspace(-0.4, 0.6, 9, dtype=np.float32)  # of grey, mean colour subtracted
 _BLOCKS = 8  # rows and columns of blocks
 _SECTORS, _BANDS = 8, 6
-N_IMAGE = 3 + 3 + 4 + len(_LEVELS) + 1 + 4
+N_IMAGE = 3 + 3 + 6 + len(_LEVELS) + 1 + 4
 N_SCAN = _SECTORS + _BANDS + 8
 
 
 def _log(x: Array) -> Array:
     """Logarithm of a share or variance, scaled to the order of 1."""
     return 0.3 * (jnp.log(x + 1e-5) + 4.0)
+
+
+def _rough(bend: Array, slope: Array) -> Array:
+    """Logarithm of mean curvature over mean slope, scaled as the others are."""
+    ratio = (bend.mean(axis=(1, 2)) + 1e-5) / (slope.mean(axis=(1, 2)) + 1e-5)
+    return 5.0 * (jnp.log(ratio) - 0.5)
 
 
 def _spread(x: Array) -> Array:
@@ -44,6 +50,9 @@ def image_statistics(image: Float[Array, "b h w 3"]) -> Float[Array, "b n"]:
     bend = jnp.abs(jnp.diff(grey, 2, axis=2))
     flat = (along < 1e-3).astype(grey.dtype)  # nothing changes from pixel to pixel
     gradients = [_log(x.mean(axis=(1, 2))) for x in (along, down, bend, flat)]
+    # How rough the grey levels are for their slope hardly depends on the scene: blur lowers it.
+    bends = bend, jnp.abs(jnp.diff(grey, 2, axis=1))
+    gradients += [_rough(b, slope) for b, slope in zip(bends, (along, down), strict=True)]
     level = grey.reshape(b, 1, -1) - jnp.asarray(_LEVELS)[None, :, None]
     histogram = jnp.exp(-0.5 * (level / 0.08) ** 2).mean(axis=-1)
     share = histogram / (histogram.sum(axis=-1, keepdims=True) + 1e-6)
@@ -89,11 +98,13 @@ def scan_statistics(config: BevConfig, bev: Float[Array, "b r c s"]) -> Float[Ar
     around = jax.lax.reduce_window(occupied, 0.0, jax.lax.add, (1, 3, 3), (1, 1, 1), "SAME")
     around = around - occupied
     whole = total + 1.0
+    alone = jnp.where(around == 0, occupied, 0.0).sum(axis=(1, 2))
     filled = (bev[..., :-1] > 0).astype(bev.dtype).sum(axis=-1)
     of_all = jnp.stack(
         [
             jnp.log1p(total) / 7.0,
-            jnp.where(around == 0, occupied, 0.0).sum(axis=(1, 2)) / whole,
+            # A few per cent in any scene, and five times as many where ranges are noisy.
+            0.5 * (jnp.log(alone / whole + 0.003) + 4.0),
             (occupied * around).sum(axis=(1, 2)) / whole / 4.0,
             bev[..., -1].sum(axis=(1, 2)) / whole,
             (filled * occupied).sum(axis=(1, 2)) / whole,

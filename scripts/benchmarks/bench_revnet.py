@@ -4,8 +4,9 @@
 
 Prints the temporary memory of the compiled gradient (2048 samples of 60 parameters, float32) at
 depths 8 and 64, with the reverse rule that recomputes activations and with JAX's own, which stores
-them; and the error of the inverse at trained weights. Expect a ratio of at most 1.1 for ours and
-of about 7 for the other. Writes `results/bench_revnet.json`; 10 s on one core.
+them; the error of the inverse at trained weights, and at weights up to 64 times as large beside its
+bound (`revnet.inverse_error_bound`). Expect a ratio of at most 1.1 for ours and of about 7 for the
+other. Writes `results/bench_revnet.json`; 10 s on one core.
 """
 
 from __future__ import annotations
@@ -39,6 +40,26 @@ def peak(forward: Any, config: Config, depth: int) -> int:
     grad = jax.jit(jax.grad(lambda p, x: jnp.sum(forward(p, x) ** 2)))
     analysis: Any = grad.lower(params, x).compile().memory_analysis()
     return int(analysis.temp_size_in_bytes)
+
+
+def extreme_weights(dim: int, dtype: str, scale: float) -> dict[str, float]:
+    """Error of x -> z -> x at random weights of a given size, its bound, the largest feature."""
+    import jax
+    import jax.numpy as jnp
+    import numpy as np
+
+    from failure import revnet
+
+    with jax.enable_x64(dtype == "float64"):
+        params = revnet.init(jax.random.key(0), dim, depth=6, scale=scale, dtype=jnp.dtype(dtype))
+        x = 3.0 * jax.random.normal(jax.random.key(1), (64, dim), jnp.dtype(dtype))
+        z = jax.jit(revnet.forward_stored)(params, x)
+        back = np.asarray(jax.jit(revnet.inverse)(params, z) - x, np.float64)
+        return {
+            "error": float(np.linalg.norm(back, axis=1).max()),
+            "bound": float(revnet.inverse_error_bound(params, x).max()),
+            "largest_feature": float(jnp.max(jnp.abs(z))),
+        }
 
 
 def inverse_error(dim: int, dtype: str) -> float:
@@ -83,6 +104,10 @@ def main(config: Config) -> dict[str, Any]:
         result[name] = {f"bytes_depth_{shallow}": few, f"bytes_depth_{deep}": many}
         result[name]["ratio"] = many / few
     result["inverse_error"] = {t: inverse_error(config.dim, t) for t in ("float32", "float64")}
+    result["extreme_weights"] = {
+        t: {f"scale_{s:g}": extreme_weights(config.dim, t, s) for s in (0.5, 1.0, 4.0, 32.0)}
+        for t in ("float32", "float64")
+    }
     write_json(config.out, {"benchmark": "revnet", **provenance(), **result})
     return result
 
@@ -94,6 +119,7 @@ def fields(found: dict[str, Any]) -> dict[str, float]:
         "ratio_stored": found["stored"]["ratio"],
         "inverse_float32": found["inverse_error"]["float32"],
         "inverse_float64": found["inverse_error"]["float64"],
+        "extreme_float32": found["extreme_weights"]["float32"]["scale_32"]["error"],
     }
 
 

@@ -201,6 +201,11 @@ RULES = (
         "--problems linear --specs --probabilities 1e-6 --methods lines --seeds 1 --dim 12 "
         "--record runs/sigma.json",
     ),
+    Rule(
+        "study_level_sets.py",
+        "--problems linear --specs --dim 12 --samples 20 --test-samples 20 --steps 2 --seeds 1 "
+        "--record runs/level_sets.json",
+    ),
     Rule("study_rare_events.py", "--runs 1 --n-importance 50 --n-subset 100 --replicates 3"),
     Rule("bench_circuits.py", "--batch 2 --repeats 1 --ngspice-samples 2", needs="ngspice"),
     Rule("bench_bo_steps.py", "--points 60 --dim 4 --steps 2 --out runs/bench_bo_steps.json"),
@@ -276,8 +281,8 @@ AREAS = {
     ),
     "circuits": (
         "find_failures", "study_failures", "study_active", "study_circuits", "study_parity",
-        "study_rare_events", "study_sigma", "bench_circuits", "bench_revnet", "bench_bo",
-        "bench_bo_steps",
+        "study_rare_events", "study_sigma", "study_level_sets", "bench_circuits", "bench_revnet",
+        "bench_bo", "bench_bo_steps",
     ),
 }  # fmt: skip
 """Scripts that need each other's files or share compiled programs; the rest is one area, too."""

@@ -8,7 +8,7 @@ learns by `RewardSTDP` with the sign of its effect on each motor.
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
-from typing import Any, NamedTuple
+from typing import Any, Literal, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -16,7 +16,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from jaxsnn import declared
-from jaxsnn._checks import require, require_whole
+from jaxsnn._checks import require, require_choice, require_whole
 from jaxsnn.agents import Agent
 from jaxsnn.encoding import poisson_spikes
 from jaxsnn.world import Outcome, Reading
@@ -100,6 +100,7 @@ def declared_agent(
     control_steps: int = 200,
     window: int = 25,
     plastic: bool = True,
+    form: Literal["step", "window"] = "step",
 ) -> Agent:
     r"""A network of `jaxsnn.declared` as an agent of `trials.run_phase` and `run_experiment`.
 
@@ -121,6 +122,9 @@ def declared_agent(
             `motor_credit` when not given.
         control_steps: steps of `wiring.dt` between two turns; window: steps between two rewards.
         plastic: False to hold the weights.
+        form: "step", in which weights change at every step, by the reward of the window before; or
+            "window", in which they are held for the window and change by the reward of the turn
+            that it asks for (`declared.window`), many times faster.
 
     Returns:
         Agent whose parameters are DriveParams and whose state is that of the network.
@@ -136,6 +140,7 @@ def declared_agent(
         ('left motor [Hz]', 'right motor [Hz]')
     """
     require_whole("window", window, 1, "give whole steps")
+    require_choice("form", form, ("step", "window"))
     require(
         control_steps >= window and control_steps % window == 0,
         f"control_steps={control_steps}: expected a multiple of window={window}; change one",
@@ -156,7 +161,9 @@ def declared_agent(
     )
 
     def rewards_of(both: Float[Array, "2"]) -> dict[str, Array]:
-        return {name: jnp.asarray(shares[name], both.dtype) @ both for name in rewarded}
+        # Two products with a number: they melt into what the reward is used for.
+        tables = {name: jnp.asarray(shares[name], both.dtype) for name in rewarded}
+        return {name: t[..., 0] * both[0] + t[..., 1] * both[1] for name, t in tables.items()}
 
     def with_weights_of(state: declared.State, other: declared.State) -> declared.State:
         held = {
@@ -186,6 +193,24 @@ def declared_agent(
         rates = jnp.asarray(encode(reading))
         none = jnp.zeros((2,), _dtype(state))
 
+        kernels = {}
+        if form == "window":
+            kernels = declared.window_kernels(wiring, params.network, window)
+            kernels = kernels if plastic else {}
+
+        def held_window(carry: tuple, index: Array) -> tuple[tuple, Array]:
+            network, rewards = carry
+            spikes = poisson_spikes(rates, window, dt=wiring.dt, key=jax.random.fold_in(key, index))
+            network, eligibility, fired = declared.window(
+                wiring, params.network, kernels, network, {sensors: spikes}
+            )
+            count = jnp.sum(fired[motors], axis=0)
+            if plastic and reward is not None:
+                turn = _turn(params, count / (window * wiring.dt))
+                given = rewards_of(jnp.asarray(reward(reading, turn), none.dtype))
+                network = declared.reinforce(wiring, params.network, network, eligibility, given)
+            return (network, rewards), count
+
         def one_window(carry: tuple, index: Array) -> tuple[tuple, Array]:
             network, rewards = carry
             spikes = poisson_spikes(rates, window, dt=wiring.dt, key=jax.random.fold_in(key, index))
@@ -207,7 +232,8 @@ def declared_agent(
         n_windows = control_steps // window
         carry: tuple
         counts: Array
-        carry, counts = jax.lax.scan(one_window, (begin, none), jnp.arange(n_windows))
+        body = held_window if form == "window" else one_window
+        carry, counts = jax.lax.scan(body, (begin, none), jnp.arange(n_windows))
         network = carry[0]
         kept = with_weights_of(network, state)
         learns = active & jnp.asarray(plastic)

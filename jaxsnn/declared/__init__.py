@@ -1,7 +1,8 @@
 """Spiking networks from a list of populations and projections, as pure functions.
 
 `declare` checks what it is given and makes a `Wiring`; `init`, `step` and `run` work with it and
-can be jitted, vmapped and scanned. `docs/snn_fidelity.md` compares each model with Brian 2.
+can be jitted, vmapped and scanned; `window` and `reinforce` take many steps at once with the
+weights held. `docs/snn_fidelity.md` compares each model with Brian 2.
 
 - Parts: `Input`, `Population`, `Projection`, `FixedProbability`.
 - Neurons: `LIF`, `AdaptiveLIF`, `Izhikevich`. Receptors: `Delta`, `Exponential`, `Conductance`.
@@ -14,6 +15,7 @@ from jaxsnn.declared.parts import FixedProbability, Input, Population, Projectio
 from jaxsnn.declared.receptors import Conductance, Delta, Exponential
 from jaxsnn.declared.short_term import TsodyksMarkram
 from jaxsnn.declared.stepping import Params, State, constants, init, run, step
+from jaxsnn.declared.windowed import reinforce, window, window_kernels
 from jaxsnn.declared.wiring import Wiring, declare
 
 __all__ = [
@@ -37,6 +39,9 @@ __all__ = [
     "constants",
     "declare",
     "init",
+    "reinforce",
     "run",
     "step",
+    "window",
+    "window_kernels",
 ]

@@ -88,7 +88,8 @@ class Bounded:
                 "population",
             )
 
-    def _changed(self, weights: Array, drive: Array) -> Array:
+    def changed(self, weights: Array, drive: Array) -> Array:
+        """The weights after a change, by the rule's dependence and within its bounds."""
         return apply_reward(
             weights,
             drive,
@@ -139,7 +140,7 @@ class PairSTDP(Bounded):
     ) -> tuple[PairTraces, Float[Array, "n_pre n_post"]]:
         """One step of the traces and of the weights; `reward` is not used."""
         state, pairs = self._pairs(state, arrived, post, dt)
-        return state, self._changed(weights, pairs)
+        return state, self.changed(weights, pairs)
 
     def _pairs(
         self, state: PairTraces, arrived: Array, post: Array, dt: float
@@ -194,7 +195,7 @@ class RewardSTDP(PairSTDP):
         state, pairs = self._pairs(state, arrived, post, dt)
         assert state.z is not None  # `init` of this class makes one
         z = state.z * jnp.exp(-dt / self.tau_z) + pairs / self.tau_z
-        return state._replace(z=z), self._changed(weights, self.gamma * dt * reward * z)
+        return state._replace(z=z), self.changed(weights, self.gamma * dt * reward * z)
 
 
 @jax.tree_util.register_dataclass
@@ -252,7 +253,7 @@ class TripletSTDP(Bounded):
         growth = r1 * (fired * (self.a2_plus + self.a3_plus * o2))
         decline = (arrived * (self.a2_minus + self.a3_minus * r2)) * o1
         new = TripletTraces(r1=r1, r2=r2 + arrived, o1=o1, o2=o2 + fired)
-        return new, self._changed(weights, growth - decline)
+        return new, self.changed(weights, growth - decline)
 
 
 Rule = PairSTDP | RewardSTDP | TripletSTDP

@@ -5,7 +5,8 @@
 
 Unit: robot-milliseconds per CPU-second (one robot, 1 ms, all 44,308 synapses of S4 plastic), world
 and learning included, robots in blocks. Also the per-step form, the share of the GEMM peak, the
-memory per robot, and how far weights held for a window drift from weights that change every
+memory per robot, where the time of a window goes, the same network put together by
+`jaxsnn.declared`, and how far weights held for a window drift from weights that change every
 millisecond. CPU time of the process, so a busy machine disturbs it little; pin it to one core.
 About three CPU-minutes, half of it compiling.
 """
@@ -20,6 +21,7 @@ from collections.abc import Callable
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.records.snn_drift import drift_rows
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     provenance,
@@ -170,6 +172,53 @@ def bench_step(robots: int, bench: Bench) -> float:
     return robots * length / cpu_time(call, bench.repeats)
 
 
+def _chain_speeds(programs: dict[str, Any], bench: Bench) -> dict[str, float]:
+    """CPU time per robot-ms of chains of windows [us], by turns so that a busy phase hits all."""
+    import jax
+
+    from snn_fusion_failure.records.snn_parts import WINDOWS
+
+    keys = jax.random.split(jax.random.key(1), bench.block)
+    held: dict[str, Any] = {}
+    times: dict[str, list[float]] = {name: [] for name in programs}
+    for name, (run, states) in programs.items():
+        held[name] = jax.block_until_ready(run(states, keys))
+    for _ in range(max(5, bench.repeats)):
+        for name, (run, _) in programs.items():
+            start = time.process_time()
+            held[name] = jax.block_until_ready(run(held[name], keys))
+            times[name].append(time.process_time() - start)
+    unit = 1e6 / (bench.block * WINDOWS * bench.window)
+    return {name: unit * sorted(t)[len(t) // 2] for name, t in times.items()}
+
+
+def time_parts(bench: Bench, whole: float) -> dict[str, float]:
+    """Where the CPU time of a robot-ms goes [us]; `whole` is that of the closed loop."""
+    from snn_fusion_failure.records.snn_parts import by_hand
+
+    names = ("spikes", "neurons", "eligibility", "learning")
+    took = _chain_speeds({n: by_hand(bench.block, bench.window, n) for n in names}, bench)
+    parts = {"random input spikes": took["spikes"]}
+    for name, (one, before) in {
+        "currents and neurons": ("neurons", "spikes"),
+        "eligibility": ("eligibility", "neurons"),
+        "change of the weights": ("learning", "eligibility"),
+    }.items():
+        parts[name] = took[one] - took[before]
+    return parts | {"world, rates, bookkeeping": whole - took["learning"], "whole": whole}
+
+
+def declared_share(bench: Bench) -> dict[str, float]:
+    """Robot-ms per CPU-second of the network by hand and declared, without a world."""
+    from snn_fusion_failure.records.snn_parts import as_declared, by_hand
+
+    took = _chain_speeds(
+        {"by_hand": by_hand(bench.block, bench.window),
+         "declared": as_declared(bench.block, bench.window)}, bench,
+    )  # fmt: skip
+    return {n: 1e6 / t for n, t in took.items()} | {"ratio": took["by_hand"] / took["declared"]}
+
+
 def memory_per_robot(bench: Bench) -> dict[str, float]:
     """Bytes per robot: the state, and the peak of the compiled phase of many robots."""
     import jax
@@ -185,67 +234,6 @@ def memory_per_robot(bench: Bench) -> dict[str, float]:
         - analysis.alias_size_in_bytes
     )
     return {"state": float(state), "peak": total / bench.memory_robots}
-
-
-def accuracy_rows(seconds: float = 2.0) -> list[dict[str, Any]]:
-    """Correlation and slope of the weights' change, held windows against every step."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from jaxsnn import network
-    from jaxsnn.encoding import poisson_spikes
-    from jaxsnn.presets import preset
-
-    steps = round(seconds * 1000)
-    reward = jnp.array([1.0, -1.0])
-    rows = []
-    for speed, gamma in (("slow", 3e-4), ("fast", 3e-3)):
-        changes: dict[int, tuple[Any, float]] = {}
-        for hold in (1, 10, 50, 100):
-            config, params = preset(
-                "S4", "tuned",
-                config={"control_steps": hold, "hold_steps": hold},
-                params={"gamma": gamma, "homeostasis": 0.0, "centring": 0.0},
-                stdp={"anti_causal": 1.0},
-            )  # fmt: skip
-
-            def run(params: Any, config: Any = config, hold: int = hold) -> Any:
-                state = network.init(jax.random.key(0), config, params)
-                rates = jnp.repeat(jnp.array([50.0, 100, 50, 0, 50, 50, 25]), 30)
-                pre = poisson_spikes(rates, steps, key=jax.random.key(1), dt=config.dt)
-                start = state.weights.hidden
-                if hold == 1:
-                    end, _ = jax.lax.scan(
-                        lambda c, x: network.step(config, params, c, x, reward), state, pre
-                    )
-                else:
-                    stdp = network.kernel(config, params)
-
-                    def body(carry: Any, x: Any) -> tuple:
-                        carry, held, _ = network.window(config, params, stdp, carry, x)
-                        new = network.reinforce(config, params, carry.weights, held, reward)
-                        return carry._replace(weights=new), None
-
-                    end, _ = jax.lax.scan(body, state, pre.reshape(-1, hold, config.n_in))
-                return end.weights.hidden - start, jnp.mean(start)
-
-            constants = jax.tree.map(lambda x: jnp.asarray(x, jnp.float32), params)
-            change, mean = jax.jit(run)(constants)
-            changes[hold] = np.asarray(change, np.float64).ravel(), float(mean)
-        exact, mean = changes[1]
-        for hold in (10, 50, 100):
-            got = changes[hold][0]
-            rows.append(
-                {
-                    "learning": speed,
-                    "hold_ms": hold,
-                    "drift": float(np.abs(exact).mean() / mean),
-                    "correlation": float(np.corrcoef(exact, got)[0, 1]),
-                    "slope": float(exact @ got / (exact @ exact)),
-                }
-            )
-    return rows
 
 
 def brian2_speed(python: Path) -> dict[str, Any]:
@@ -279,6 +267,15 @@ def main(bench: Bench) -> dict[str, Any]:
             f"{100 * speed * work / peak / 1e9:.0f} % of the GEMM peak, "
             f"{speed / out['step'][16]:.1f} x per-step"
         )
+        out.setdefault("share_of_peak", {})[n] = speed * work / peak / 1e9
+    out["parts_us_per_robot_ms"] = time_parts(bench, 1e6 / max(out["window"].values()))
+    for name, took in out["parts_us_per_robot_ms"].items():
+        print(f"{name}: {took:.2f} us per robot-ms")
+    out["declared"] = declared_share(bench)
+    print(
+        f"declared, without a world: {out['declared']['declared']:.0f} robot-ms/s, "
+        f"{out['declared']['ratio']:.2f} x the network by hand"
+    )
     out["memory_bytes_per_robot"] = memory_per_robot(bench)
     print("memory per robot [kB]:", {k: round(v / 1e3) for k, v in
                                      out["memory_bytes_per_robot"].items()})  # fmt: skip
@@ -289,7 +286,7 @@ def main(bench: Bench) -> dict[str, Any]:
               f"ours is {ratio:.0f} x")  # fmt: skip
         out["ratio_brian2"] = ratio
     if bench.accuracy:
-        out["accuracy"] = accuracy_rows()
+        out["accuracy"] = drift_rows()
         for row in out["accuracy"]:
             print(row)
     if bench.record:

@@ -57,7 +57,7 @@ def agents(net, **options):
     )
 
 
-def drive(net, keys, n_learn, n_test=2, max_steps=100):
+def drive(net, keys, n_learn, n_test=2, max_steps=100, **options):
     return jax.jit(
         lambda words, params, map: run_experiment(
             None,
@@ -68,7 +68,7 @@ def drive(net, keys, n_learn, n_test=2, max_steps=100):
             n_test=n_test,
             max_steps=max_steps,
             block=4,
-            agents=agents(net),
+            agents=agents(net, **options),
             keep_states=True,
         )
     )(
@@ -143,10 +143,11 @@ def test_weights_are_held_while_the_robot_waits_and_when_frozen():
 
 
 @pytest.mark.slow
-def test_a_declared_network_learns_to_reach_the_target():
+@pytest.mark.parametrize("form", ["step", "window"])
+def test_a_declared_network_learns_to_reach_the_target(form):
     """With its weights as drawn it hardly ever arrives; after a few trials nearly always."""
     net, keys = network(), jax.random.split(jax.random.key(1), 4)
-    found = drive(net, keys, n_learn=12)
+    found = drive(net, keys, n_learn=12, form=form)
     frozen = declared_agent(net, encode, plastic=False)
     naive = jax.jit(
         lambda words, params, map: run_experiment(

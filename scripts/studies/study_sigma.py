@@ -106,7 +106,9 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
         found, first, gradients = ak.estimate, ak.first_failure, ak.n_gradients
         cosine = nearest(case, ak.point)
     elif base == "guided_lines":
-        found, point, first = guided_lines(case.performance, case.threshold, case.dim, key=key)
+        found, point, first = guided_lines(
+            case.performance, case.threshold, case.dim, key=key, most=max(400, 4 * case.dim)
+        )
         cosine = nearest(case, point)
     elif base == "subset_simulation":
         found = rare_events.subset_simulation(

@@ -198,8 +198,8 @@ RULES = (
     ),
     Rule(
         "study_sigma.py",
-        "--problems linear --specs --probabilities 1e-6 --methods lines --seeds 1 --dim 12 "
-        "--record runs/sigma.json",
+        "--problems linear --specs --netlists --probabilities 1e-6 --methods lines --searches "
+        "--seeds 1 --dim 12 --record runs/sigma.json",
     ),
     Rule(
         "study_level_sets.py",

@@ -109,7 +109,17 @@ class Study:
     """Compare variants."""
 
     study: Literal[
-        "readings", "gamma", "goal", "tau_z", "homeostasis", "rates", "window", "way", "way_gamma"
+        "readings",
+        "gamma",
+        "goal",
+        "tau_z",
+        "homeostasis",
+        "rates",
+        "window",
+        "way",
+        "way_gamma",
+        "critic",
+        "unseen",
     ] = "readings"
     model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
     scenario: Literal[1, 2, 3] = 1

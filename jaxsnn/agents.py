@@ -15,8 +15,10 @@ from jaxtyping import Array, Bool, Float, Key
 
 from jaxsnn import network
 from jaxsnn.config import NetworkConfig, NetworkParams, check_network
-from jaxsnn.encoding import RateTable, group_rates, interval_rates, poisson_spikes
+from jaxsnn.critic import credited, features, shaped_reward, temporal_difference
+from jaxsnn.encoding import poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
+from jaxsnn.network_input import group_input, input_rates
 from jaxsnn.rewards import motor_rewards, scale_by_remaining_turn, terminal_reward
 from jaxsnn.turn_goal import turn_reward, update_recent_turn, way_reward
 from jaxsnn.window import STDPKernel
@@ -58,11 +60,12 @@ class SNNParams(NamedTuple):
 
 
 class SNNMemory(NamedTuple):
-    """Eligibility of the last window, the reading that the network acted on, the turns before."""
+    """Eligibility of the last window, the reading acted on, the turns before, and this turn."""
 
     eligibility: Eligibility | None
     reading: Reading
     recent_turn: Array
+    turn: Array
 
 
 def snn_params(config: NetworkConfig, params: NetworkParams) -> SNNParams:
@@ -95,34 +98,6 @@ def steering_angle(params: NetworkParams, rates: Float[Array, "2"]) -> Float[Arr
     return params.steering_gain * (right - left)
 
 
-def input_rates(
-    config: NetworkConfig,
-    params: NetworkParams,
-    reading: Reading,
-    recent_turn: Float[Array, ""],
-    *,
-    table: RateTable | None = None,
-) -> Float[Array, " n_in"]:
-    """Firing rate of each input neuron for a reading [Hz].
-
-    Args:
-        config: NetworkConfig.
-        params: NetworkParams.
-        reading: of the sensors.
-        recent_turn: leaky mean of the last turns [deg], for `config.turn_groups`.
-        table: `config.rates`, worked out once.
-    """
-    sensed = (reading.sonar, reading.distance, reading.angle)
-    if config.input_code == "interval":
-        rates = interval_rates(params.interval_rate, *sensed)
-    else:
-        rates = group_rates(config.rates if table is None else table, *sensed)
-    if config.turn_groups:
-        both = jnp.clip(jnp.stack([recent_turn, -recent_turn]) / 60.0, 0.0, 1.0)
-        rates = jnp.concatenate([rates, (params.turn_rate * both).astype(rates.dtype)])
-    return jnp.repeat(rates, config.group_exc + config.group_inh)
-
-
 def snn_agent(
     config: NetworkConfig, *, plastic: bool = True, reward: RewardFunction | None = None
 ) -> Agent:
@@ -146,6 +121,7 @@ def snn_agent(
     """
     n_windows = config.control_steps // config.hold_steps
     table = config.rates
+    foresees = plastic and (config.critic == "td" or config.shaping != "none")
 
     def reward_of(
         constants: NetworkParams, reading: Reading, window: Eligibility, recent_turn: Array
@@ -153,6 +129,8 @@ def snn_agent(
         turn = steering_angle(constants, window.output_count / window.duration)
         if reward is not None:
             return reward(constants, reading, recent_turn, turn)
+        if config.guidance == "none":
+            return jnp.zeros_like(window.output_count)
         if config.guidance == "way":
             return way_reward(constants.goal, reading, turn)
         if config.guidance == "graded":
@@ -161,6 +139,31 @@ def snn_agent(
             constants.reward, reading.sonar, reading.distance, reading.angle, turn
         )
         return scale_by_remaining_turn(constants.reward, rewards, turn)
+
+    def foresee(
+        constants: NetworkParams,
+        state: NetworkState,
+        memory: SNNMemory,
+        after: Reading,
+        end: Array,
+        ended: Array,
+        active: Array,
+    ) -> tuple[NetworkState, Array]:
+        """The step's reward with its potential; with a critic what it did not expect of it."""
+        shaped = shaped_reward(constants.critic, memory.reading, after, config.shaping)
+        reward = jnp.where(ended, end, shaped)
+        if state.critic is None:
+            return state, reward
+
+        def sensed(reading: Reading, recent_turn: Array) -> Array:
+            return features(group_input(config, constants, reading, recent_turn, table=table))
+
+        critic, error = temporal_difference(
+            constants.critic, state.critic, sensed(memory.reading, memory.recent_turn),
+            sensed(after, state.recent_turn), reward, ended,
+        )  # fmt: skip
+        kept = jax.tree.map(lambda a, b: jnp.where(active, a, b), critic, state.critic)
+        return state._replace(critic=kept), error
 
     def learning_share(constants: NetworkParams, state: NetworkState) -> Array:
         return (1.0 / (1.0 + state.updates / constants.anneal)).astype(state.hidden.v.dtype)
@@ -181,6 +184,9 @@ def snn_agent(
         recent_turn = jnp.where(fresh, 0.0, state.recent_turn)
         rates = input_rates(config, constants, reading, recent_turn, table=table)
         state = network.reset_membranes(constants, state, fresh)
+        if state.critic is not None:
+            trace = jnp.where(fresh, 0.0, state.critic.trace).astype(state.critic.trace.dtype)
+            state = state._replace(critic=state.critic._replace(trace=trace))
         baselines = state.baseline_input, state.baseline_hidden
 
         def draw(index: Array | int) -> Array:
@@ -228,7 +234,7 @@ def snn_agent(
         steering = jnp.clip(steering_angle(constants, firing[:2]), -limit, limit)
         turned = update_recent_turn(constants.goal, recent_turn, steering)
         state = state._replace(recent_turn=turned.astype(state.recent_turn.dtype))
-        return state, steering, SNNMemory(eligibility, reading, recent_turn), firing
+        return state, steering, SNNMemory(eligibility, reading, recent_turn, steering), firing
 
     def learn(
         params: SNNParams,
@@ -246,7 +252,14 @@ def snn_agent(
             observed = next_reading
         given = reward_of(constants, observed, memory.eligibility, memory.recent_turn)
         end = terminal_reward(constants.reward, outcome.collided, outcome.arrived)
-        given = jnp.where(outcome.collided | outcome.arrived, end, given)
+        ended = outcome.collided | outcome.arrived
+        if foresees and next_reading is not None:
+            state, error = foresee(constants, state, memory, next_reading, end, ended, active)
+            given = jnp.where(ended, 0.0, given) + credited(
+                constants.critic, error, memory.turn, config.credit
+            )
+        else:
+            given = jnp.where(ended, end, given)
         going = active.astype(state.weights.hidden.dtype)
         learning = going * learning_share(constants, state)
         weights = network.reinforce(
@@ -263,6 +276,6 @@ def snn_agent(
         act=act,
         learn=learn,
         finite=finite,
-        needs_next=plastic and config.reward_timing == "after",
+        needs_next=foresees or (plastic and config.reward_timing == "after"),
         info=("left motor [Hz]", "right motor [Hz]", "hidden [Hz]"),
     )

@@ -19,6 +19,7 @@ from jaxsnn._checks import (
     require_positive,
     require_whole,
 )
+from jaxsnn.critic import Credit, CriticParams, Potential, check_critic
 from jaxsnn.encoding import GROUPS, AngleCode, InputCode, RateTable, rate_table
 from jaxsnn.neurons import LIFParams, check_lif
 from jaxsnn.plasticity import Bounds, Rule, STDPParams, check_stdp
@@ -50,7 +51,14 @@ class NetworkConfig:
             left and to the right: what a network without recurrence has of memory.
         guidance: rewards on the way by the "nearest" obstacle (the source) or "graded" from all
             sonars (`turn_goal.turn_reward`), or by the turn onto the shortest "way" from a trainer
-            that knows the map (`turn_goal.way_reward`).
+            that knows the map (`turn_goal.way_reward`), or "none".
+        critic: "td" replaces the reward of a step's end by its temporal-difference error
+            (`jaxsnn.critic`), "none" is the source.
+        credit: who gets that error and what the potential gives, see `critic.credited`.
+        shaping: potential of the reward of a step, see `critic.potential`.
+        mirror: tie the two halves of the network (`jaxsnn.mirror`).
+        starts: learning trials begin in the map's start "circles" (the source) or "anywhere" on it
+            (`ways.training_map`).
 
     Raises:
         ValueError, TypeError: what makes no network, by name and value.
@@ -71,7 +79,12 @@ class NetworkConfig:
     reward_timing: Literal["before", "after"] = "before"
     input_code: InputCode = "sensor"
     turn_groups: bool = False
-    guidance: Literal["nearest", "graded", "way"] = "nearest"
+    guidance: Literal["nearest", "graded", "way", "none"] = "nearest"
+    critic: Literal["none", "td"] = "none"
+    credit: Credit = "turn"
+    shaping: Potential = "none"
+    mirror: bool = False
+    starts: Literal["circles", "anywhere"] = "circles"
 
     def __post_init__(self) -> None:
         """Refuse sizes and choices that make no network."""
@@ -102,11 +115,20 @@ class NetworkConfig:
             "reward_timing": ("before", "after"),
             "input_code": tuple(GROUPS),
             "turn_groups": (False, True),
-            "guidance": ("nearest", "graded", "way"),
+            "guidance": ("nearest", "graded", "way", "none"),
+            "critic": ("none", "td"),
+            "credit": ("global", "turn"),
+            "shaping": ("none", "straight", "way"),
+            "mirror": (False, True),
+            "starts": ("circles", "anywhere"),
         }
         for name, allowed in choices.items():
             require_choice(name, getattr(self, name), allowed)
         rate_table(self.encoding, self.angle_code)
+        require(
+            not self.mirror or self.input_code == "interval",
+            "mirror=True: expected input_code='interval'; the rate of an angle has no mirror image",
+        )
 
     @property
     def n_groups(self) -> int:
@@ -173,6 +195,7 @@ class NetworkParams(NamedTuple):
         interval_rate: of the group that is on, with one group for each interval [Hz].
         turn_rate: of a turn group after turns of 60 degrees [Hz].
         goal: constants of the graded reward.
+        critic: constants of the critic and the potential.
     """
 
     hidden: LIFParams = LIFParams()
@@ -201,6 +224,7 @@ class NetworkParams(NamedTuple):
     interval_rate: float | Array = 150.0
     turn_rate: float | Array = 100.0
     goal: TurnGoalParams = TurnGoalParams()
+    critic: CriticParams = CriticParams()
 
 
 class Weights(NamedTuple):
@@ -237,6 +261,7 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
     check_stdp(params.stdp, dt=config.dt)
     check_rewards(params.reward)
     check_turn_goal(params.goal)
+    check_critic(params.critic)
     for name in ("max_turn", "anneal"):
         value = concrete(getattr(params, name))
         good = value is None or bool((value > 0).all())
@@ -251,17 +276,9 @@ def check_network(config: NetworkConfig, params: NetworkParams) -> None:
     require_positive("tau_baseline", params.tau_baseline, "give it in seconds")
     for name in ("w_max", "w_max_low", "gain_input", "gain_output", "rate_hidden", "rate_output"):
         require_positive(name, getattr(params, name), "give it in mV (rates: Hz)")
-    for name in (
-        "gamma",
-        "gamma_output",
-        "w_min",
-        "init_low",
-        "homeostasis",
-        "homeostasis_output",
-        "centring",
-        "left_motor",
-        "right_motor",
-    ):
+    sizes = ("gamma", "gamma_output", "w_min", "init_low", "homeostasis", "homeostasis_output",
+             "centring", "left_motor", "right_motor")  # fmt: skip
+    for name in sizes:
         require_positive(name, getattr(params, name), "give a number >= 0", zero=True)
     require_finite("steering_gain", params.steering_gain, "give degrees per Hz")
     low = concrete(params.w_min)

@@ -191,6 +191,7 @@ def make_runner(
     max_steps: int = 200,
     block: int = 8,
     circles: Int[Array, " trials"] | None = None,
+    test_map: world.WorldParams | None = None,
     record: bool = False,
     keep_states: bool = False,
 ) -> Callable[..., Experiment]:
@@ -207,7 +208,7 @@ def make_runner(
         return run_experiment(
             config, snn_params(config, params), map, keys=seed_keys(numbers),
             n_learn=n_learn, n_test=n_test, n_online=n_online, max_steps=max_steps, block=block,
-            circles=circles, weights=weights, states=states, record=record,
+            circles=circles, weights=weights, states=states, test_map=test_map, record=record,
             keep_states=keep_states,
         )  # fmt: skip
 

@@ -10,6 +10,8 @@ from jaxtyping import Array, Bool, Float, Key
 
 from jaxsnn._checks import default_float, require, require_key
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights, check_network, weight_bounds
+from jaxsnn.critic import Critic, critic_init
+from jaxsnn.mirror import tied
 from jaxsnn.neurons import LIFParams, LIFState, lif_init
 from jaxsnn.plasticity import STDPState, check_bounds, stdp_init
 from jaxsnn.running_mean import Baseline, baseline_init
@@ -20,7 +22,7 @@ class NetworkState(NamedTuple):
 
     The baselines are running means of what input and hidden neurons fire; see `running_mean`.
     `recent_turn` is a leaky mean of the robot's turns in this trial [deg], `updates` the number of
-    control steps in which the network has learnt.
+    control steps in which the network has learnt, `critic` its value of what it senses.
     """
 
     weights: Weights
@@ -32,6 +34,7 @@ class NetworkState(NamedTuple):
     baseline_hidden: Baseline
     recent_turn: Float[Array, ""]
     updates: Float[Array, ""]
+    critic: Critic | None = None
 
 
 class Spikes(NamedTuple):
@@ -68,7 +71,7 @@ def init(
         for k, shape, bound in zip(keys, shapes, top, strict=True):
             u = jax.random.uniform(k, shape)
             drawn.append((params.init_low + (1.0 - params.init_low) * u) * bound)
-        weights = Weights(*drawn)
+        weights = tied(config, Weights(*drawn)) if config.mirror else Weights(*drawn)
     else:
         check_weights(config, params, weights)
     return NetworkState(
@@ -83,6 +86,7 @@ def init(
         baseline_hidden=baseline_init(config.n_hidden),
         recent_turn=jnp.zeros((), default_float()),
         updates=jnp.zeros((), default_float()),
+        critic=critic_init(config.n_groups) if config.critic == "td" else None,
     )
 
 

@@ -9,6 +9,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights, neuron_signs, weight_bounds
+from jaxsnn.mirror import tied
 from jaxsnn.plasticity import apply_reward
 from jaxsnn.rewards import synapse_signs
 
@@ -88,4 +89,6 @@ def reinforce(
             for w, d, top in zip(scaled, drives, bounds, strict=True)
         )
     )
+    if config.mirror:
+        changed = tied(config, changed)
     return jax.tree.map(lambda new, old: new.astype(old.dtype), changed, weights)

@@ -1,7 +1,7 @@
 """Trained networks in a file, to be tested or to go on with on another map.
 
-Kept are weights, running means of the firing and the number of steps in which the network has
-learnt; membranes and traces start anew with every trial.
+Kept are weights, running means of the firing, the number of steps in which the network has learnt
+and its critic; membranes and traces start anew with every trial.
 """
 
 from __future__ import annotations
@@ -16,9 +16,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsnn import network
-from jaxsnn.config import NetworkConfig, NetworkParams, Weights
+from jaxsnn.config import NetworkConfig, NetworkParams
 from jaxsnn.network import NetworkState
-from jaxsnn.running_mean import Baseline
+
+KEPT = ("weights", "baseline_input", "baseline_hidden", "updates", "critic")
 
 
 def save_networks(path: str | Path, config: NetworkConfig, states: NetworkState) -> Path:
@@ -31,7 +32,7 @@ def save_networks(path: str | Path, config: NetworkConfig, states: NetworkState)
     if path.suffix != ".npz":
         raise ValueError(f"save={path}: expected a name that ends in .npz; rename it")
     path.parent.mkdir(parents=True, exist_ok=True)
-    kept = (states.weights, states.baseline_input, states.baseline_hidden, states.updates)
+    kept = tuple(getattr(states, name) for name in KEPT)
     arrays: dict[str, Any] = {
         f"leaf_{i}": np.asarray(x) for i, x in enumerate(jax.tree.leaves(kept))
     }
@@ -62,19 +63,17 @@ def load_networks(path: str | Path, config: NetworkConfig, params: NetworkParams
         ) from error
     given = dataclasses.asdict(config)
     sizes = ("hidden_exc", "hidden_inh", "group_exc", "group_inh", "input_code", "turn_groups",
-             "encoding", "angle_code")  # fmt: skip
+             "encoding", "angle_code", "critic")  # fmt: skip
     for name in sizes:
-        if stored.get(name) != given[name]:
+        if stored.get(name, "none") != given[name]:
             raise ValueError(
                 f"from={path}: expected networks with {name}={given[name]!r}, they have "
                 f"{stored.get(name)!r}; use the model and the changes that they were trained with"
             )
     one = network.init(jax.random.key(0), config, params)
-    shape = jax.tree.structure((one.weights, one.baseline_input, one.baseline_hidden, one.updates))
-    kept: tuple[Weights, Baseline, Baseline, jax.Array] = jax.tree.unflatten(shape, leaves)
-    robots = len(kept[3])
-    network.check_weights(config, params, kept[0], robots)
+    shape = jax.tree.structure(tuple(getattr(one, name) for name in KEPT))
+    kept = dict(zip(KEPT, jax.tree.unflatten(shape, leaves), strict=True))
+    robots = len(kept["updates"])
+    network.check_weights(config, params, kept["weights"], robots)
     state = jax.tree.map(lambda x: jnp.broadcast_to(x, (robots, *x.shape)), one)
-    return state._replace(
-        **dict(zip(("weights", "baseline_input", "baseline_hidden", "updates"), kept, strict=True))
-    )
+    return state._replace(**kept)

@@ -7,9 +7,9 @@ import numpy as np
 from scipy import ndimage, sparse
 from scipy.sparse import csgraph
 
-from jaxsnn._checks import require_positive
+from jaxsnn._checks import require, require_positive
 from jaxsnn.config import NetworkConfig
-from jaxsnn.planner import Obstacles
+from jaxsnn.planner import Obstacles, path_field
 from jaxsnn.way import WayLength
 from jaxsnn.world import WorldParams
 
@@ -82,12 +82,56 @@ def way_length(
 
 
 def training_map(config: NetworkConfig, map: WorldParams) -> WorldParams:
-    """The map as a network learns on it: with its ways for `guidance="way"`, else as it is.
+    """The map as a network learns on it: with what its config asks for, else as it is.
+
+    Its ways for `guidance="way"` and `shaping="way"`, starts all over it for `starts="anywhere"`.
+    Test on the map itself.
 
     Returns:
         WorldParams.
     """
-    return with_way(map) if config.guidance == "way" and map.way is None else map
+    if "way" in (config.guidance, config.shaping) and map.way is None:
+        map = with_way(map)
+    return with_starts_anywhere(map) if config.starts == "anywhere" else map
+
+
+def with_starts_anywhere(map: WorldParams, *, spacing: int | float = 40.0) -> WorldParams:
+    """The map with start circles all over it, so that a few trials meet many situations.
+
+    Args:
+        map: one map; moving obstacles are left out.
+        spacing: distance of the centres, which fill a grid; circles have half of it as radius
+            [px]. One that does not leave the robot's radius free or touches the arrival circle is
+            not among them.
+
+    Returns:
+        WorldParams; headings are towards the target, plus or minus any angle.
+
+    Raises:
+        ValueError: no circle is free.
+
+    Source: exploring starts, Sutton and Barto (2018), section 5.3.
+    """
+    require_positive("spacing", spacing, "give pixels")
+    x0, y0, x1, y1 = np.asarray(map.bounds, np.float64)
+    radius = 0.5 * spacing
+    lines = np.arange(x0 + radius, x1, spacing), np.arange(y0 + radius, y1, spacing)
+    points = np.stack(np.meshgrid(*lines, indexing="ij"), axis=-1).reshape(-1, 2)
+    room = Obstacles.of(map).clearance(points, points)
+    gap = np.hypot(*(points - np.asarray(map.target, np.float64)).T)
+    apart = gap - radius > float(map.arrival_radius)
+    free = (room >= radius + float(map.robot_radius)) & apart
+    free &= np.isfinite(path_field(map).lengths(points))
+    require(
+        bool(free.any()),
+        f"spacing={spacing}: expected a free circle of half that radius; lower it",
+    )
+    starts = np.column_stack([points[free], np.full(free.sum(), radius)])
+    return map._replace(
+        starts=jnp.asarray(starts, jnp.float32),
+        start_probs=jnp.full(len(starts), 1.0 / len(starts), jnp.float32),
+        heading_spread=jnp.float32(180.0),
+    )
 
 
 def with_way(

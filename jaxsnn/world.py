@@ -28,7 +28,7 @@ from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxsnn import geometry
 from jaxsnn._checks import require_key
-from jaxsnn.way import WayLength, turn_onto_way
+from jaxsnn.way import WayLength, remaining_way, turn_onto_way
 
 N_SONARS = 5
 
@@ -90,6 +90,7 @@ class Reading(NamedTuple):
     angle: Array  # [] angle from heading to target in (-180, 180], positive = to the left [deg]
     # No sensor, and no network's input: what a trainer that knows the map tells a reward.
     way_turn: Array | None = None  # [] turn onto the shortest way [deg]; None without `map.way`
+    way_left: Array | None = None  # [] length of the shortest way from here [px]
 
 
 class Outcome(NamedTuple):
@@ -230,7 +231,9 @@ def observe(params: WorldParams, state: WorldState, *, others: Discs | None = No
     if params.way is None:
         return Reading(ranges, distance, angle)
     way_turn = turn_onto_way(params.way, state.x, state.y, state.heading)
-    return Reading(ranges, distance, angle, way_turn.astype(angle.dtype))
+    way_left = remaining_way(params.way, state.x, state.y)
+    told = (way_turn.astype(angle.dtype), way_left.astype(angle.dtype))
+    return Reading(ranges, distance, angle, *told)
 
 
 def _heading_and_move(

@@ -9,20 +9,24 @@ held-out detour family: there a learner trains on one map of the family's traini
 on maps of its test split that nothing was tuned on, weights or table frozen. Metrics: `sr_testing`
 after the source's 20 learning trials (2,000 for Q-learning, about 10,000 for PPO, whose reward
 counts progress along the shortest way), `sr_testing_60_trials` with `--learn-trials 60`, and
-`path_ratio` of the trials that arrived. `S4` is the reading "tuned", `S4_literal` the source's,
-`S4_guided` the one with a graded reward, `S4_way` the one whose trainer knows the way, as PPO's.
+`path_ratio` of the trials that arrived. `S1` to `S4` are the reading "tuned", `S1_literal` to
+`S4_literal` the source's, `S4_guided` the one with a graded reward, `S4_way` the one whose trainer
+knows the way, as PPO's.
 Networks use the seeds of the tables of record from 0 on. `--choose` trains on several maps of the
 training split, one after the other, and drives on maps of the validation split, which says what a
 map is worth as a teacher (`results/study_detour_choice.json`).
 
-Rows go to `results/study_detour.json` as each one ends; one that is there already with as many
-seeds is skipped, so the study can be broken off and gone on with. Drivers take seconds, Q-learning
-two CPU-minutes per row, a network about 10 CPU-seconds per seed and row.
+The network "S4_way" is compared with the drivers robot by robot (`comparisons`: paired t tests,
+Holm's correction over all of them). Rows go to `results/study_detour.json` as each one ends; one
+that is there already with as many seeds is skipped, so the study can be broken off and gone on
+with. Drivers take seconds, Q-learning two CPU-minutes per row, a network about 10 CPU-seconds per
+seed and row.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import functools
 import time
 from typing import Any
 
@@ -34,13 +38,15 @@ from snn_fusion_failure.records.detour_rows import (
     trials_per_map,
     values_of,
 )
-from snn_fusion_failure.records.rows import record_table, recorded, summarize
+from snn_fusion_failure.records.detour_runs import drive_tests, frozen_phase, learn_on
+from snn_fusion_failure.records.rows import Compared, record_table, recorded, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, progress, repository, run_command
 from snn_fusion_failure.runs.origin import check_recordable
 
 DRIVERS = ("blind", "reflex_60", "reflex_100")
 NETWORKS = (
-    *("S1", "S2", "S3", "S4", "S4_literal", "S4_guided", "S3_guided"),
+    *("S1", "S2", "S3", "S4", "S4_guided", "S3_guided"),
+    *("S1_literal", "S2_literal", "S3_literal", "S4_literal"),
     *("S1_way", "S2_way", "S3_way", "S4_way"),
 )
 LEARNERS = ("q_learning", "ppo")
@@ -53,6 +59,8 @@ PPO: dict[str, Any] = {
     "initial_std": 0.8,
 }
 PPO_PARAMS = {"learning_rate": 1e-3}
+# The networks against drivers that learn nothing, robot by robot: same seeds, same starts.
+COMPARED = Compared("sr_testing", tuple(("S4_way", driver) for driver in DRIVERS))
 TITLE = "Drivers and learners on maps that need a detour"
 
 
@@ -95,7 +103,6 @@ def run_driver(config: Study, model: str, row: str) -> dict[str, list[float]]:
     """A driver that learns nothing, from the networks' own starts."""
     import jax
     import jax.numpy as jnp
-    import numpy as np
 
     from jaxsnn.drivers import DRIVERS as PARAMS
     from jaxsnn.drivers import drive
@@ -105,65 +112,24 @@ def run_driver(config: Study, model: str, row: str) -> dict[str, list[float]]:
     def phase(map: Any, keys: Any, n: int) -> Any:
         return drive(params, map, keys=keys, n_trials=n, max_steps=config.max_steps)
 
-    return _test(config, row, phase, jnp, np)
-
-
-def _test(config: Study, row: str, phase: Any, jnp: Any, np: Any) -> dict[str, list[float]]:
-    """Drive `phase(map, keys, n_trials)` over the test maps of a row."""
-    import jax
-
-    from jaxsnn.experiment import phase_keys, seed_keys
-    from jaxsnn.trials import start_states
-
     n, maps = _tests(config, row)
-    roots = jax.vmap(lambda k: phase_keys(k)[2])(seed_keys(jnp.asarray(_seeds(config))))
-    status, path, points = [], [], []
-    starts = jax.jit(
-        lambda map, keys: jax.vmap(lambda k: start_states(map, key=k, n_trials=n))(keys)
-    )
-    for i, map in enumerate(maps):
-        keys = jax.vmap(lambda k, i=i: jax.random.fold_in(k, i))(roots) if len(maps) > 1 else roots
-        result, begin = phase(map, keys, n), starts(map, keys)
-        status.append(np.asarray(result.status))
-        path.append(np.asarray(result.path))
-        points.append(np.stack([np.asarray(begin.x), np.asarray(begin.y)], axis=-1))
-    return values_of(maps, np.stack(status), np.stack(path), np.stack(points))
+    return drive_tests(maps, n, _seeds(config), phase)
 
 
 def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
     """A spiking network: learning on the row's map, testing with frozen weights."""
-    import jax
-    import jax.numpy as jnp
-    import numpy as np
-
-    from jaxsnn import agents, trials
-    from jaxsnn.experiment import learning_circles, make_runner
     from jaxsnn.presets import preset
-    from jaxsnn.ways import training_map
 
     name, _, reading = model.partition("_")
     network, params = preset(name, reading or "tuned")
-    scenario = 1 if is_family(row) else int(row[-1])
-    learn = make_runner(
-        network, training_map(network, train_map(row)), n_learn=config.learn_trials, n_test=1,
-        max_steps=config.max_steps, block=config.block, keep_states=True,
-        circles=learning_circles(scenario, config.learn_trials),
+    states = learn_on(
+        network, params, train_map(row), _seeds(config),
+        scenario=1 if is_family(row) else int(row[-1]), n_learn=config.learn_trials,
+        max_steps=config.max_steps, block=config.block,
     )  # fmt: skip
-    states = jax.tree.map(jnp.asarray, learn(_seeds(config), params).states)
-    frozen = agents.snn_agent(network, plastic=False)
-    constants = jax.tree.map(jnp.float32, agents.snn_params(network, params))
-
-    @jax.jit
-    def test(map: Any, words: Any, states: Any, constants: Any) -> Any:
-        return trials.run_phase(
-            frozen, constants, map, states, keys=jax.random.wrap_key_data(words),
-            n_trials=trials_per_map(row, config.test_trials), max_steps=config.max_steps,
-        )[1]  # fmt: skip
-
-    def phase(map: Any, keys: Any, n: int) -> Any:
-        return test(map, jax.random.key_data(keys), states, constants)
-
-    return _test(config, row, phase, jnp, np)
+    n, maps = _tests(config, row)
+    phase = frozen_phase(network, params, states, max_steps=config.max_steps)
+    return drive_tests(maps, n, _seeds(config), phase)
 
 
 def run_q_learning(config: Study, model: str, row: str) -> dict[str, list[float]]:
@@ -255,6 +221,11 @@ def main(config: Study) -> dict[str, float]:
     metric = "sr_testing" if config.learn_trials == 20 else "sr_testing_60_trials"
     cells = [(m, r) for m in config.models for r in rows if (m, r, metric) not in held]
     start, found = time.process_time(), {}
+    record: Any = functools.partial(
+        record_table, path, path.stem, title, preset=f"{config.seeds} robots", compared=[COMPARED]
+    )
+    if not cells:
+        record([])  # what is compared is worked out anew from the rows that are there
     with progress() as bar:
         task = bar.add_task("cells", total=len(cells), status="")
         for model, row in cells:
@@ -268,7 +239,7 @@ def main(config: Study) -> dict[str, float]:
                  **summarize(v)}
                 for name, v in values.items() if v
             ]  # fmt: skip
-            record_table(path, path.stem, title, new, preset=f"{config.seeds} robots")
+            record(new)
             found[f"{model} {row}"] = sum(values[metric]) / len(values[metric])
             bar.update(task, advance=1, status=f"{model}, {row}: {found[f'{model} {row}']:.0f} %")
             print(model, row, round(found[f"{model} {row}"], 1), flush=True)

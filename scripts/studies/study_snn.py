@@ -3,11 +3,14 @@
     python scripts/studies/study_snn.py --study readings --seeds 8 --scenario 2
     python scripts/studies/study_snn.py --study gamma --model S2 --seeds 8 --max-minutes 30
     python scripts/studies/study_snn.py --study way --map detour/validation/0
+    python scripts/studies/study_snn.py --study critic --map detour/train/0 --unseen 20
 
 Every variant is a reading with a few changes, run over the same seeds on a training scenario or a
-validation map; test maps and the seeds of the tables of record are never used. Rows go to
-`results/study_snn_STUDY.json` as each variant ends; a variant that is there already (same seeds) is
-skipped, so a study can be broken off and gone on with. About 3 CPU-seconds per seed and variant.
+validation map; test maps and the seeds of the tables of record are never used. With `--unseen`
+robots learn on a map of the split train and are tested on maps of the split validation that they
+have not met, one trial of each robot on each. Rows go to `results/study_snn_STUDY.json` as each
+variant ends; a variant that is there already (same seeds) is skipped, so a study can be broken off
+and gone on with. About 3 CPU-seconds per seed and variant.
 """
 
 from __future__ import annotations
@@ -23,6 +26,8 @@ from snn_fusion_failure.runs import enable_compilation_cache, repository, run_co
 from snn_fusion_failure.runs.networks import changed_preset
 
 TITLE = "Variants of a network around a setting"
+# Only the end of a step is rewarded, after the move.
+ALONE = ("config.guidance=none", "config.hold_steps=200")
 # study -> variant -> (reading, changes)
 STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     # One reading or option at a time: what the source says with one of ours, ours without one.
@@ -80,6 +85,39 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         f"way, gamma {g:g}": ("way", (f"params.gamma={g}",))
         for g in (1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 4.8e-3)
     },
+    # The reward's end of step by its potential and by a critic's error, beside the trainer's reward
+    # and in its place.
+    "critic": {
+        "way": ("way", ()),
+        "way, potential along the way": ("way", ("config.shaping=way",)),
+        "way, critic": ("way", ("config.critic=td",)),
+        "way, critic and potential": ("way", ("config.critic=td", "config.shaping=way")),
+        "way, critic and potential, error to all synapses": (
+            "way",
+            ("config.critic=td", "config.shaping=way", "config.credit=global"),
+        ),
+        "potential along the way alone": ("way", (*ALONE, "config.shaping=way")),
+        "critic alone": ("way", (*ALONE, "config.critic=td")),
+        "critic and potential alone": ("way", (*ALONE, "config.critic=td", "config.shaping=way")),
+        "critic and straight potential alone": (
+            "way",
+            (*ALONE, "config.critic=td", "config.shaping=straight"),
+        ),
+        "critic and potential alone, error to all synapses": (
+            "way",
+            (*ALONE, "config.critic=td", "config.shaping=way", "config.credit=global"),
+        ),
+    },
+    # What a network of one map knows of others: more situations in as many trials.
+    "unseen": {
+        "way": ("way", ()),
+        "way, halves tied": ("way", ("config.mirror=true", "params.gamma=6e-4")),
+        "way, starts anywhere": ("way", ("config.starts=anywhere",)),
+        "way, halves tied, starts anywhere": (
+            "way",
+            ("config.mirror=true", "params.gamma=6e-4", "config.starts=anywhere"),
+        ),
+    },
     "tau_z": {
         f"tuned, tau_z {t:g} s": ("tuned", (f"stdp.tau_z={t}",)) for t in (0.01, 0.025, 0.1, 0.3)
     },
@@ -128,6 +166,8 @@ class Study:
     seeds: int = 8
     first_seed: int = 1000
     """Not among the seeds of the tables of record (0 to 63)."""
+    unseen: int = 0
+    """Test on so many maps of the family's validation split instead of on the training map."""
     test_trials: int = 10
     max_steps: int = 200
     block: int = 8
@@ -137,15 +177,47 @@ class Study:
     """No variant is begun after so many minutes of CPU time."""
 
 
+def _seeds(config: Study) -> list[int]:
+    return list(range(config.first_seed, config.first_seed + config.seeds))
+
+
+def _on_its_map(
+    config: Study, run: Any, params: Any
+) -> tuple[dict[str, list[float]], dict[str, Any]]:
+    """Scores of each robot on the map that it has learnt on, and the mean rates in testing [Hz]."""
+    from jaxsnn import scores
+
+    records = scores.per_seed(run(_seeds(config), params), _seeds(config))
+    rates = [sum(r["testing"]["rates"][k] for r in records) / len(records) for k in range(3)]
+    return scores.score(records), {"rates_testing": rates}
+
+
+def _on_unseen_maps(
+    config: Study, network: Any, params: Any, map: Any
+) -> tuple[dict[str, list[float]], dict[str, Any]]:
+    """Scores of each robot on maps that it has not met, one trial on each."""
+    from snn_fusion_failure.records.detour_rows import FAMILY, tested_maps
+    from snn_fusion_failure.records.detour_runs import drive_tests, frozen_phase, learn_on
+
+    states = learn_on(
+        network, params, map, _seeds(config), max_steps=config.max_steps, block=config.block
+    )
+    maps = tested_maps(FAMILY, config.unseen, "validation")
+    phase = frozen_phase(network, params, states, max_steps=config.max_steps)
+    return drive_tests(maps, 1, _seeds(config), phase), {}
+
+
 def main(config: Study) -> dict[str, Any]:
     """Run the variants that are missing; returns SR-testing by variant."""
-    from jaxsnn import scenarios, scores
+    from jaxsnn import scenarios
     from jaxsnn.experiment import learning_circles, make_runner
     from jaxsnn.map_files import named_map
     from jaxsnn.ways import training_map
 
     if config.map is not None and config.map.split("/")[1:2] == ["test"]:
         raise ValueError(f"map={config.map!r}: expected a map of the split validation or train")
+    if config.unseen and (config.map or "").split("/")[1:2] != ["train"]:
+        raise ValueError(f"map={config.map!r}: expected a map of the split train with --unseen")
     variants = STUDIES[config.study]
     map = scenarios.scenario(config.scenario) if config.map is None else named_map(config.map)
     unknown = set(config.only) - set(variants)
@@ -159,6 +231,7 @@ def main(config: Study) -> dict[str, Any]:
         if r["metric"] == "sr_testing" and r["n"] >= config.seeds
     }
     model = f"{config.model} {config.map or f'scenario {config.scenario}'}"
+    model += f", {config.unseen} unseen maps" if config.unseen else ""
     circles = None if config.map else learning_circles(config.scenario, 20)
     done: dict[str, float] = {}
     runners: dict[Any, Any] = {}
@@ -169,22 +242,23 @@ def main(config: Study) -> dict[str, Any]:
         if time.process_time() - start > 60 * config.max_minutes:
             break
         built, params = changed_preset(config.model, reading, changes)
-        if built not in runners:
-            runners[built] = make_runner(
-                built, training_map(built, map), n_learn=20, n_test=config.test_trials,
-                max_steps=config.max_steps, block=config.block, circles=circles,
-            )  # fmt: skip
-        numbers = list(range(config.first_seed, config.first_seed + config.seeds))
-        experiment = runners[built](numbers, params)
-        records = scores.per_seed(experiment, numbers)
-        summary = {k: summarize(v) for k, v in scores.score(records).items() if v}
+        if config.unseen:
+            values, rates = _on_unseen_maps(config, built, params, map)
+        else:
+            if built not in runners:
+                runners[built] = make_runner(
+                    built, training_map(built, map), n_learn=20, n_test=config.test_trials,
+                    test_map=map, max_steps=config.max_steps, block=config.block,
+                    circles=circles if built.starts == "circles" else None,
+                )  # fmt: skip
+            values, rates = _on_its_map(config, runners[built], params)
+        summary = {k: summarize(v) for k, v in values.items() if v}
         rows = [
             {"row": name, "model": model, "metric": metric, "setting": reading,
              "changes": list(changes), **values}
             for metric, values in summary.items()
         ]  # fmt: skip
-        rates = [sum(r["testing"]["rates"][k] for r in records) / len(records) for k in range(3)]
-        rows[0]["rates_testing"] = rates
+        rows[0] |= rates
         preset = f"{config.seeds} seeds, {config.test_trials} testing trials"
         record_table(path, path.stem, TITLE, rows, preset=preset)
         done[name] = summary["sr_testing"]["mean"]

@@ -73,9 +73,12 @@ def run_seeds(
     from jaxsnn.ways import training_map
 
     network, params = changed_preset(config.model, config.reading, config.changes)
-    circles = None if config.map else learning_circles(config.scenario, config.learn_trials)
+    circles = None
+    if config.map is None and network.starts == "circles":
+        circles = learning_circles(config.scenario, config.learn_trials)
     run = make_runner(
         network, training_map(network, map), n_learn=config.learn_trials, n_test=n_test,
+        test_map=map,
         n_online=config.online_trials, max_steps=config.max_steps, block=config.block,
         circles=circles, record=config.figures, keep_states=config.save is not None,
     )  # fmt: skip

@@ -95,6 +95,16 @@ RULES = (
         f"{_ROBOT} --test-trials 1 --only 'way, gamma 0.0003'",
         forget="results/study_snn_way_gamma.json",
     ),
+    Rule(
+        "study_snn.py critic",
+        f"{_ROBOT} --unseen 1 --only 'critic and potential alone'",
+        forget="results/study_snn_critic.json",
+    ),
+    Rule(
+        "study_snn.py unseen",
+        f"{_ROBOT} --unseen 1 --only 'way, halves tied'",
+        forget="results/study_snn_unseen.json",
+    ),
     Rule("figures_snn.py", "--scenarios 1"),
     Rule("compare_snn.py"),
     Rule(

@@ -10,9 +10,10 @@ import jax.numpy as jnp
 import numpy as np
 import pytest
 
-from jaxsnn import Status, agents, encoding, run_experiment, scenarios, snn_params
+from jaxsnn import Status, encoding, run_experiment, scenarios, snn_params
 from jaxsnn.config import check_network
 from jaxsnn.drivers import DRIVERS, driver_agent
+from jaxsnn.network_input import input_rates
 from jaxsnn.presets import preset
 from jaxsnn.saved import load_networks, save_networks
 from jaxsnn.turn_goal import TurnGoalParams, turn_goal, turn_reward
@@ -78,7 +79,7 @@ def small(**config):
 
 def test_turn_groups_fire_with_the_recent_turns():
     config, params = small(turn_groups=True)
-    rates = agents.input_rates(config, params, reading([300.0] * 5), jnp.asarray(-30.0))
+    rates = input_rates(config, params, reading([300.0] * 5), jnp.asarray(-30.0))
     assert rates.shape == (config.n_in,) == (9 * 4,)
     assert rates[-8:].tolist() == [0.0] * 4 + [50.0] * 4
 

@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from jaxsnn import navigation, planner, scenarios, success_rate, world
-from jaxsnn.agents import input_rates
 from jaxsnn.drivers import drive_fixed, fixed_agent
+from jaxsnn.network_input import input_rates
 from jaxsnn.presets import preset
 from jaxsnn.turn_goal import way_reward
 from jaxsnn.way import WayLength, remaining_way, turn_onto_way

@@ -61,7 +61,7 @@ def _unpack(robot: world.WorldState) -> world.WorldState:
 class NavigationEnv(Env):
     """One robot on one map.
 
-    Observation `[8]`: `jaxsnn.navigation.observation`. Action `[1]` in [-1, 1]: 1 steers
+    Observation `[sonars + 3]`: `jaxsnn.navigation.observation`. Action `[1]` in [-1, 1]: 1 steers
     45 degrees to the left. Reward: `jaxsnn.navigation.navigation_reward`. `done` is 1.0
     after arrival, collision or a state that is not finite; `metrics` say which. The limit on
     steps is brax's `episode_length`.
@@ -113,8 +113,8 @@ class NavigationEnv(Env):
 
     @property
     def observation_size(self) -> int:
-        """Five sonars, distance, sine and cosine of the angle."""
-        return navigation.OBSERVATION_SIZE
+        """Sonars, distance, sine and cosine of the angle."""
+        return navigation.observation_size(self.params)
 
     @property
     def action_size(self) -> int:

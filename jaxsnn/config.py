@@ -52,16 +52,15 @@ class NetworkConfig:
         guidance: rewards on the way by the "nearest" obstacle (the source) or "graded" from all
             sonars (`turn_goal.turn_reward`), or by the turn onto the shortest "way" from a trainer
             that knows the map (`turn_goal.way_reward`), or "none".
-        critic: "td" replaces the reward of a step's end by its temporal-difference error
-            (`jaxsnn.critic`), "none" is the source.
+        critic: "td": a step's reward is its temporal-difference error (`jaxsnn.critic`).
         credit: who gets that error and what the potential gives, see `critic.credited`.
         shaping: potential of the reward of a step, see `critic.potential`.
         mirror: tie the two halves of the network (`jaxsnn.mirror`).
-        starts: learning trials begin in the map's start "circles" (the source) or "anywhere" on it
-            (`ways.training_map`).
+        n_sonars: of the map's robot, an odd number (`make_map(sonar_angles=...)`).
+        starts: of learning trials, the map's "circles" or "anywhere" (`ways.training_map`).
 
     Raises:
-        ValueError, TypeError: what makes no network, by name and value.
+        ValueError, TypeError: what makes no network.
     """
 
     rule: Rule = "multiplicative"
@@ -84,6 +83,7 @@ class NetworkConfig:
     credit: Credit = "turn"
     shaping: Potential = "none"
     mirror: bool = False
+    n_sonars: int = 5
     starts: Literal["circles", "anywhere"] = "circles"
 
     def __post_init__(self) -> None:
@@ -99,6 +99,8 @@ class NetworkConfig:
             n = getattr(self, name)
             require_whole(name, n, 0, "give 0 for none")
         require(self.n_in > 0, "group_exc=0, group_inh=0: expected an input neuron; raise one")
+        odd = self.n_sonars >= 3 and self.n_sonars % 2 == 1
+        require(odd, f"n_sonars={self.n_sonars}: expected an odd number, 3 or more; add one")
         require_positive("dt", self.dt, "give the step in seconds, 1e-3 for one millisecond")
         for name in ("control_steps", "hold_steps"):
             require_whole(name, getattr(self, name), 1, "give at least one step")
@@ -133,7 +135,7 @@ class NetworkConfig:
     @property
     def n_groups(self) -> int:
         """Input groups."""
-        return GROUPS[self.input_code] + 2 * self.turn_groups
+        return GROUPS[self.input_code](self.n_sonars) + 2 * self.turn_groups
 
     @property
     def n_in(self) -> int:

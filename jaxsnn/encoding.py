@@ -6,6 +6,7 @@ the angle to the target. Each reading falls into an interval, each interval has 
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Literal, NamedTuple
 
 import jax
@@ -31,9 +32,11 @@ from jaxsnn.sensor_intervals import (
     sonar_interval,
 )
 
-N_SONARS = 5
-GROUPS = {"sensor": N_SONARS + 2, "interval": N_SONARS * N_NEAR + N_DISTANCE + N_OCTANT}
-"""Input groups of the two codes: one for each sensor, or one for each interval of each sensor."""
+GROUPS: dict[str, Callable[[int], int]] = {
+    "sensor": lambda sonars: sonars + 2,
+    "interval": lambda sonars: sonars * N_NEAR + N_DISTANCE + N_OCTANT,
+}
+"""Input groups by sonars: one for each sensor, or one for each interval of each sensor."""
 
 InputCode = Literal["sensor", "interval"]
 
@@ -109,11 +112,11 @@ def check_rates(rates: RateTable | Float[Array, "..."], *, dt: float) -> None:
 
 def group_rates(
     table: RateTable,
-    sonar: Float[Array, "5"],
+    sonar: Float[Array, " sonars"],
     distance: Float[Array, ""],
     angle: Float[Array, ""],
-) -> Float[Array, "7"]:
-    """Firing rates of the seven input groups for one reading.
+) -> Float[Array, " groups"]:
+    """Firing rates of the input groups, one for each sensor, for one reading.
 
     Args:
         table: RateTable.
@@ -122,7 +125,7 @@ def group_rates(
         angle: from the heading to the target [deg], positive to the left.
 
     Returns:
-        Rates [Hz]: five sonars, distance, angle.
+        Rates [Hz]: sonars, distance, angle.
 
     Source: Shim (2020), section 2.4.2; `sensor_intervals` says what belongs to which interval.
     """
@@ -137,10 +140,10 @@ def group_rates(
 
 def interval_rates(
     rate: float | Float[Array, ""],
-    sonar: Float[Array, "5"],
+    sonar: Float[Array, " sonars"],
     distance: Float[Array, ""],
     angle: Float[Array, ""],
-) -> Float[Array, "32"]:
+) -> Float[Array, " groups"]:
     """Firing rates of one group for each interval: `rate` where the reading lies, 0 elsewhere.
 
     A synapse can then speak for one interval of one sensor, where with one rate for each sensor it

@@ -26,8 +26,8 @@ from jaxsnn.way import WayLength
 from jaxsnn.world import WorldParams
 
 
-def _spaces() -> tuple[spaces.Box, spaces.Box]:
-    size = (navigation.OBSERVATION_SIZE,)
+def _spaces(params: WorldParams) -> tuple[spaces.Box, spaces.Box]:
+    size = (navigation.observation_size(params),)
     # A sonar in an obstacle's way reads no more than its range; sine and cosine are within 1.
     return spaces.Box(-1.0, 1.0, size, np.float32), spaces.Box(-1.0, 1.0, (1,), np.float32)
 
@@ -51,7 +51,7 @@ class RobotEnv(gymnasium.Env[np.ndarray, np.ndarray]):
         self, params: WorldParams, *, max_steps: int = 200, way: WayLength | None = None
     ) -> None:
         env = navigation.navigation_env(params, max_steps=max_steps, way=way)
-        self.observation_space, self.action_space = _spaces()
+        self.observation_space, self.action_space = _spaces(params)
         self._reset, self._step = jax.jit(env.reset), jax.jit(env.step)
         self._state: Any = None
 
@@ -95,7 +95,7 @@ class RobotVectorEnv(VectorEnv[np.ndarray, np.ndarray, np.ndarray]):
         require_whole("robots", robots, 1, "ask for at least one")
         env = navigation.navigation_env(params, max_steps=max_steps, way=way)
         self.num_envs = robots
-        self.single_observation_space, self.single_action_space = _spaces()
+        self.single_observation_space, self.single_action_space = _spaces(params)
         batch = gymnasium.vector.utils.batch_space
         self.observation_space = batch(self.single_observation_space, robots)
         self.action_space = batch(self.single_action_space, robots)

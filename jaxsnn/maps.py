@@ -17,7 +17,7 @@ from jaxtyping import Array
 
 from jaxsnn import geometry
 from jaxsnn.planner import Obstacles, path_field
-from jaxsnn.world import N_SONARS, WorldParams
+from jaxsnn.world import WorldParams
 
 Number = int | float
 Point = Sequence[Number]
@@ -91,7 +91,8 @@ def make_map(
         heading_spread: start headings are towards the target plus or minus this [deg].
         speed: path per control step [px].
         robot_radius: radius of the disc robot [px].
-        sonar_angles: directions of the sonars from the heading, leftmost first [deg].
+        sonar_angles: directions of the sonars from the heading, leftmost first, an odd number
+            of them [deg]; networks take it as `NetworkConfig.n_sonars`.
         sonar_range: range of the sonars [px].
         distance_range: range of the distance sensor [px].
         polygon_velocity: motion of each polygon [px per step]; all stand still by default.
@@ -151,9 +152,11 @@ def make_map(
         raise ValueError(
             f"patrol_steps={patrol_steps}: expected a whole number of steps >= 1; round it"
         )
-    if len(sonar_angles) != N_SONARS or not np.isfinite(sonar_angles).all():
+    n_sonars = len(sonar_angles)
+    if n_sonars < 3 or n_sonars % 2 == 0 or not np.isfinite(sonar_angles).all():
         raise ValueError(
-            f"sonar_angles={list(sonar_angles)}: expected {N_SONARS} finite angles; one per sonar"
+            f"sonar_angles={list(sonar_angles)}: expected an odd number of finite angles, 3 or "
+            "more; one per sonar, the middle one ahead"
         )
     goal = _rows("target", target, 2)
     begin = _rows("starts", starts, 3)
@@ -167,11 +170,11 @@ def make_map(
             f"start_probs={probs.tolist()}: expected one number >= 0 for each of the {len(begin)} "
             "start circles, not all zero; leave them out for equal shares"
         )
-    failed, stuck = np.zeros(N_SONARS, bool), np.zeros(N_SONARS)
+    failed, stuck = np.zeros(n_sonars, bool), np.zeros(n_sonars)
     for index, value in (sonar_stuck or {}).items():
-        if not 0 <= index < N_SONARS or not 0.0 <= value <= sonar_range:
+        if not 0 <= index < n_sonars or not 0.0 <= value <= sonar_range:
             raise ValueError(
-                f"sonar_stuck={{{index}: {value}}}: expected a sonar 0..{N_SONARS - 1} and a value "
+                f"sonar_stuck={{{index}: {value}}}: expected a sonar 0..{n_sonars - 1} and a value "
                 f"in [0, {sonar_range:g}]; change it"
             )
         failed[index], stuck[index] = True, value

@@ -10,7 +10,6 @@ import jax.numpy as jnp
 import numpy as np
 
 from jaxsnn.config import NetworkConfig, Weights
-from jaxsnn.encoding import N_SONARS
 from jaxsnn.sensor_intervals import N_DISTANCE, N_NEAR, N_OCTANT
 
 
@@ -25,7 +24,7 @@ def mirrored_inputs(config: NetworkConfig) -> np.ndarray:
         >>> mirrored_inputs(config)[[0, 17, 23, 25, 28]].tolist()
         [16, 1, 23, 31, 28]
     """
-    sonars = np.arange(N_SONARS * N_NEAR).reshape(N_SONARS, N_NEAR)[::-1].ravel()
+    sonars = np.arange(config.n_sonars * N_NEAR).reshape(-1, N_NEAR)[::-1].ravel()
     distances = sonars.size + np.arange(N_DISTANCE)
     octants = sonars.size + N_DISTANCE + (-np.arange(N_OCTANT)) % N_OCTANT
     groups = np.concatenate([sonars, distances, octants])

@@ -15,7 +15,6 @@ from jaxsnn._checks import require_whole
 from jaxsnn.ppo_config import Env, Transition
 from jaxsnn.way import WayLength, remaining_way
 
-OBSERVATION_SIZE = world.N_SONARS + 3
 # A full action turns the robot by this much [deg].
 STEERING_SCALE = 45.0
 
@@ -24,7 +23,7 @@ class Drive(NamedTuple):
     """What one control step of a robot gives a learner."""
 
     robot: world.WorldState
-    obs: Float[Array, "8"]
+    obs: Float[Array, "o"]
     reward: Float[Array, ""]
     outcome: world.Outcome
 
@@ -35,8 +34,13 @@ class _Navigation(NamedTuple):
     start: Array  # [2]
 
 
-def observation(params: world.WorldParams, reading: world.Reading) -> Float[Array, "8"]:
-    """Readings in [-1, 1]: five sonars, the distance, and sine and cosine of the angle."""
+def observation_size(params: world.WorldParams) -> int:
+    """Numbers in an observation on this map: its sonars, the distance, two for the angle."""
+    return params.sonar_angles.shape[-1] + 3
+
+
+def observation(params: world.WorldParams, reading: world.Reading) -> Float[Array, "o"]:
+    """Readings in [-1, 1]: sonars, the distance, and sine and cosine of the angle."""
     angle = jnp.deg2rad(reading.angle)
     rest = [reading.distance / params.distance_range, jnp.sin(angle), jnp.cos(angle)]
     return jnp.concatenate([reading.sonar / params.sonar_range, jnp.stack(rest)])
@@ -73,7 +77,7 @@ def navigation_reward(
 
 def start_robot(
     params: world.WorldParams, *, key: Key[Array, ""]
-) -> tuple[world.WorldState, Float[Array, "8"]]:
+) -> tuple[world.WorldState, Float[Array, "o"]]:
     """A robot in a start circle, and its first observation."""
     robot = world.reset(params, key=key)
     return robot, observation(params, world.observe(params, robot))

@@ -5,6 +5,7 @@ from __future__ import annotations
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsnn._checks import require
 from jaxsnn.config import NetworkConfig, NetworkParams
 from jaxsnn.encoding import RateTable, group_rates, interval_rates
 from jaxsnn.world import Reading
@@ -40,6 +41,12 @@ def group_input(
     table: RateTable | None = None,
 ) -> Float[Array, " groups"]:
     """Firing rate of each input group for a reading [Hz]; arguments as for `input_rates`."""
+    n = reading.sonar.shape[0]
+    require(
+        n == config.n_sonars,
+        f"n_sonars={config.n_sonars}: expected the {n} sonars of the map's robot; give the network "
+        "as many",
+    )
     sensed = (reading.sonar, reading.distance, reading.angle)
     if config.input_code == "interval":
         rates = interval_rates(params.interval_rate, *sensed)

@@ -298,7 +298,7 @@ def plot_trial(
         params: the map; moving obstacles move.
         path: positions `[steps, 2]` [px].
         headings: `[steps]` [rad].
-        sonar: readings `[steps, 5]` [px]; no rays are drawn without them.
+        sonar: readings `[steps, sonars]` [px]; no rays are drawn without them.
         arrived: the trial ended at the target.
         collided: the trial ended in a collision.
         title: text above the picture.
@@ -325,7 +325,7 @@ def plot_trial(
     obstacles = _draw_map(ax, params)
     ax.set_title(title)
     (trail,) = ax.plot([], [], "-", color=COLOURS[0], linewidth=1.4)
-    rays = [ax.plot([], [], "-", color=COLOURS[4], linewidth=0.8)[0] for _ in range(world.N_SONARS)]
+    rays = [ax.plot([], [], "-", color=COLOURS[4], linewidth=0.8)[0] for _ in params.sonar_angles]
     body = Circle((0, 0), 1.5 * float(params.robot_radius), color=COLOURS[0], zorder=3)
     nose = Wedge((0, 0), 3.0 * float(params.robot_radius), 0, 1, color=COLOURS[0], zorder=3)
     ax.add_patch(body)

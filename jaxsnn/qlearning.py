@@ -93,6 +93,12 @@ def discretize(reading: world.Reading) -> Int[Array, ""]:
 
     Source: Shim & Li (2017), section 2.4.2 and Fig. 2.4.
     """
+    n = reading.sonar.shape[0]
+    require(
+        n == world.N_SONARS,
+        f"sonar=<{n} readings>: expected {world.N_SONARS}, for whose intervals the table has its "
+        "entries; take a map with so many sonars",
+    )
     sonar = sensor_intervals.sonar_interval(reading.sonar)
     distance = sensor_intervals.distance_interval(reading.distance)
     region = sensor_intervals.angle_region(reading.angle)

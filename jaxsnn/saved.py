@@ -19,7 +19,7 @@ from jaxsnn import network
 from jaxsnn.config import NetworkConfig, NetworkParams
 from jaxsnn.network import NetworkState
 
-KEPT = ("weights", "baseline_input", "baseline_hidden", "updates", "critic")
+KEPT = ("weights", "baseline_input", "baseline_hidden", "updates", "critic", "n_sonars")
 
 
 def save_networks(path: str | Path, config: NetworkConfig, states: NetworkState) -> Path:
@@ -63,9 +63,10 @@ def load_networks(path: str | Path, config: NetworkConfig, params: NetworkParams
         ) from error
     given = dataclasses.asdict(config)
     sizes = ("hidden_exc", "hidden_inh", "group_exc", "group_inh", "input_code", "turn_groups",
-             "encoding", "angle_code", "critic")  # fmt: skip
+             "encoding", "angle_code", "critic", "n_sonars")  # fmt: skip
     for name in sizes:
-        if stored.get(name, "none") != given[name]:
+        # A file from before there was such a choice has its default.
+        if stored.get(name, getattr(NetworkConfig, name)) != given[name]:
             raise ValueError(
                 f"from={path}: expected networks with {name}={given[name]!r}, they have "
                 f"{stored.get(name)!r}; use the model and the changes that they were trained with"

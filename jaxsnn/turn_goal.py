@@ -73,13 +73,14 @@ def turn_goal(
 
     Args:
         params: TurnGoalParams.
-        reading: five sonars, distance and angle.
+        reading: sonars, the middle one ahead, distance and angle.
         recent_turn: leaky mean of the last turns [deg].
     """
     half = reading.sonar.shape[0] // 2
-    reach = jnp.stack(
-        [params.side, params.diagonal, params.front, params.diagonal, params.side]
-    ).astype(reading.sonar.dtype)
+    between = [params.diagonal] * (half - 1)
+    reach = jnp.stack([params.side, *between, params.front, *between, params.side]).astype(
+        reading.sonar.dtype
+    )
     near = jnp.maximum(0.0, 1.0 - reading.sonar / reach)
     push = jnp.max(near[half + 1 :]) - jnp.max(near[:half])
     push = push + params.commitment * recent_turn / 60.0

@@ -31,6 +31,7 @@ from jaxsnn._checks import require_key
 from jaxsnn.way import WayLength, remaining_way, turn_onto_way
 
 N_SONARS = 5
+"""Of the source's robot; `make_map(sonar_angles=...)` takes any odd number."""
 
 
 class WorldParams(NamedTuple):
@@ -57,7 +58,7 @@ class WorldParams(NamedTuple):
     heading_spread: Array  # [] start heading: towards the target, plus or minus this [deg]
     speed: Array  # [] path per control step [px]
     robot_radius: Array  # [] [px]
-    sonar_angles: Array  # [5] directions of the sonars from the heading, left to right [deg]
+    sonar_angles: Array  # [n] directions of the sonars from the heading, left to right [deg]
     sonar_range: Array  # [] [px]
     distance_range: Array  # [] range of the distance sensor [px]
     # Extensions, off by default.
@@ -67,8 +68,8 @@ class WorldParams(NamedTuple):
     sonar_noise: Array  # [] standard deviation [px]
     distance_noise: Array  # [] standard deviation [px]
     angle_noise: Array  # [] standard deviation [deg]
-    sonar_failed: Array  # [5] bool: this sonar reports its stuck value
-    sonar_stuck: Array  # [5] what a failed sonar reports [px]
+    sonar_failed: Array  # [n] bool: this sonar reports its stuck value
+    sonar_stuck: Array  # [n] what a failed sonar reports [px]
     way: WayLength | None = None  # shortest ways, for rewards alone; made by `ways.with_way`
 
 
@@ -85,7 +86,7 @@ class WorldState(NamedTuple):
 class Reading(NamedTuple):
     """What the sensors say."""
 
-    sonar: Array  # [5] distance to what each sonar sees, at most sonar_range [px]
+    sonar: Array  # [n] distance to what each sonar sees, at most sonar_range [px]
     distance: Array  # [] distance to the target, at most distance_range [px]
     angle: Array  # [] angle from heading to target in (-180, 180], positive = to the left [deg]
     # No sensor, and no network's input: what a trainer that knows the map tells a reward.
@@ -218,10 +219,9 @@ def observe(params: WorldParams, state: WorldState, *, others: Discs | None = No
     )
     distance = jnp.sqrt(jnp.sum(to_target**2))
 
-    noise = jax.random.normal(
-        jax.random.fold_in(state.key, state.t), (N_SONARS + 2,), dtype=ranges.dtype
-    )
-    ranges = jnp.clip(ranges + params.sonar_noise * noise[:N_SONARS], 0.0, params.sonar_range)
+    n = ranges.shape[0]
+    noise = jax.random.normal(jax.random.fold_in(state.key, state.t), (n + 2,), dtype=ranges.dtype)
+    ranges = jnp.clip(ranges + params.sonar_noise * noise[:n], 0.0, params.sonar_range)
     ranges = jnp.where(params.sonar_failed, params.sonar_stuck, ranges)
     distance = jnp.clip(distance + params.distance_noise * noise[-2], 0.0, params.distance_range)
     angle = angle + params.angle_noise * noise[-1]

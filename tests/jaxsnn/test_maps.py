@@ -58,7 +58,7 @@ CLOSED_RING = [
         ({"robot_radius": float("nan")}, "robot_radius=nan"),
         ({"sonar_noise": -1.0}, "sonar_noise=-1.0: expected a finite number >= 0"),
         ({"patrol_steps": 0}, "patrol_steps=0: expected a whole number"),
-        ({"sonar_angles": (0.0, 1.0)}, "expected 5 finite angles"),
+        ({"sonar_angles": (0.0, 1.0)}, "expected an odd number of finite angles"),
         ({"sonar_stuck": {5: 100.0}}, "expected a sonar 0..4"),
         ({"sonar_stuck": {2: 400.0}}, r"value in \[0, 300\]"),
         ({"start_probs": (0.0,)}, "not all zero"),

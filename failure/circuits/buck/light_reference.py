@@ -9,6 +9,8 @@ both sides are open damps the ringing of the coil.
 
 from __future__ import annotations
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 
 from failure.circuits.buck import light_load, schematic
@@ -75,6 +77,17 @@ def _controller() -> list[str]:
     ]
 
 
+def _trip_offsets(x: np.ndarray) -> np.ndarray:
+    """By how much each sample's output lies below the reference at the trip [V]."""
+    u = np.asarray(x, np.float64).reshape(len(x), -1, 2).transpose(1, 2, 0)
+    chosen = [schematic.MOSFETS.index(m) for m in light_load.LOOP_MOSFETS]
+    with jax.enable_x64(True):
+        offset, _ = jax.jit(lambda u: light_load.trip_offset(u, model="level1"))(
+            jnp.asarray(u[chosen])
+        )
+        return np.asarray(offset)
+
+
 def light_decks(
     x: np.ndarray,
     *,
@@ -93,6 +106,8 @@ def light_decks(
         One text per sample; each prints `vmean`, `vmax` and `vmin` of the third pulse period.
     """
     values, stretch = values_of(FULL, x)
+    # Near the steady state: from farther away the third pulse would still be on the way to it.
+    start = schematic.V_REF - _trip_offsets(x) + 3e-3
     # Charge of a pulse over the load, and room for what the comparator and a heavy pulse add.
     period = 40e-9 / load + 1e-6
     control = [
@@ -106,15 +121,16 @@ def light_decks(
         "print vmax",
         "print vmin",
     ]
-    return sample_decks(
+    decks = sample_decks(
         "BUCK AT LIGHT LOAD", FULL, values, control,
         stretch=stretch,
         model="level1",
         waves={"Iload": ((0.0, load), (1.0, load))},
         own=_controller(),
         options=f"reltol={reltol!r}",
-        extra=".ic v(out)=1.203 v(oe)=0 v(lx)=1.203 v(sw)=1.203 v(gp)=2.5 v(gn)=0 v(qh)=0 v(ql)=0",
+        extra=".ic v(out)=@ v(oe)=0 v(lx)=@ v(sw)=@ v(gp)=2.5 v(gn)=0 v(qh)=0 v(ql)=0",
     )  # fmt: skip
+    return [deck.replace("@", f"{v:.6f}") for deck, v in zip(decks, start, strict=True)]
 
 
 def light_reference(

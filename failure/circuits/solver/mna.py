@@ -246,10 +246,16 @@ def source_current(
         drop = full[system.index(load.p)] - full[system.index(load.n)]
         sign = (load.p == node) - (load.n == node)
         total = total + sign * values.load[k] * jnp.tanh(drop / load.knee)
-    for k, m in enumerate(system.netlist.of(Mosfet)):
-        if node in (m.drain, m.source):
-            vd, vg, vs = (full[system.index(t)] for t in (m.drain, m.gate, m.source))
-            params = MosParams(*(leaf[k] for leaf in values.mos))
-            current, _, _ = drain_current(system.model, params, vd, vg, vs)
-            total = total + ((m.drain == node) - (m.source == node)) * current
+    mosfets = system.netlist.of(Mosfet)
+    near = np.array([k for k, m in enumerate(mosfets) if node in (m.drain, m.source)], int)
+    if near.size:
+        # All of them at once: one by one each would be a program of its own to the compiler.
+        d, g, t = (
+            np.array([system.index(getattr(mosfets[k], a)) for k in near])
+            for a in ("drain", "gate", "source")
+        )
+        params = MosParams(*(leaf[near] for leaf in values.mos))
+        current, _, _ = drain_current(system.model, params, full[d], full[g], full[t])
+        signs = [(mosfets[k].drain == node) - (mosfets[k].source == node) for k in near]
+        total = total + jnp.asarray(signs, v.dtype) @ current
     return total

@@ -35,6 +35,16 @@ def pytest_addoption(parser: pytest.Parser) -> None:
     )
 
 
+def pytest_configure(config: pytest.Config) -> None:
+    """Compile the programs of the default suite without optimization, which halves its time.
+
+    Most of them run for a moment. The slow tests train, and run what users run.
+    """
+    flags = os.environ.get("XLA_FLAGS", "")
+    if config.option.markexpr != "slow" and "backend_optimization_level" not in flags:
+        os.environ["XLA_FLAGS"] = f"{flags} --xla_backend_optimization_level=0".strip()
+
+
 def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
     """Leave out the slow tests of other parts; the parts are made over all collected ones."""
     text = config.getoption("--slow-part")

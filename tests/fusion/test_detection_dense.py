@@ -239,6 +239,7 @@ def test_low_precision_is_the_same_network_rounded() -> None:
 
 
 @pytest.mark.relaxed
+@pytest.mark.slow
 def test_it_is_trained_by_the_same_loop() -> None:
     example, _ = make_example(TINY, a_frame())
     train = DetectorTrainConfig(

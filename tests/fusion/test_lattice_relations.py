@@ -107,7 +107,10 @@ CASES: dict[str, tuple[LatticeConfig, np.ndarray]] = {
 }  # fmt: skip
 
 
-MANY = ("trapezoid_falling", "two_trapezoids", "range_dominance_falling", "joint_falling")
+MANY = (
+    "trapezoid_of_monotone", "trapezoid_falling", "two_trapezoids", "range_dominance_falling",
+    "joint_falling", "joint_peak",
+)  # fmt: skip
 EACH = [pytest.param(name, marks=pytest.mark.slow if name in MANY else ()) for name in CASES]
 """Every case; those that take another program for what others show as well are slow."""
 
@@ -253,8 +256,8 @@ STEPPED = {
 @pytest.mark.parametrize(
     ("name", "dtype"),
     [
-        ("trusts", jnp.bfloat16),
         ("joint", jnp.float32),
+        pytest.param("trusts", jnp.bfloat16, marks=pytest.mark.slow),
         pytest.param("trusts", jnp.float32, marks=pytest.mark.slow),
         pytest.param("joint", jnp.bfloat16, marks=pytest.mark.slow),
         pytest.param("ranges", jnp.float32, marks=pytest.mark.slow),

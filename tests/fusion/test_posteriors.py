@@ -84,7 +84,7 @@ def test_draws_of_laplace_have_its_moments() -> None:
     np.testing.assert_allclose(
         normalize(mean, "softmax"), predict(CONFIG, MAIN, X).weights, atol=1e-6
     )
-    found = laplace_predictive(CONFIG, MAIN, laplace, X, key=jax.random.key(0), n_draws=4000)
+    found = laplace_predictive(CONFIG, MAIN, laplace, X, key=jax.random.key(0), n_draws=16000)
     c = np.asarray(covariance)
     sd = np.sqrt(c[:, 0, 0] + c[:, 1, 1] - 2 * c[:, 0, 1])
     gap = np.asarray(mean[:, 0] - mean[:, 1])

@@ -205,7 +205,13 @@ def test_the_encoder_is_trunk_and_readout() -> None:
     np.testing.assert_allclose(alone, np.maximum(wanted, 0.0), atol=1e-5)
 
 
-@pytest.mark.parametrize("model", ["baseline", "argate_l", "oracle", "embracenet"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        "argate_l", "embracenet", pytest.param("baseline", marks=pytest.mark.slow),
+        pytest.param("oracle", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_any_recipe_takes_the_reversible_encoder(model: str) -> None:
     config = dataclasses.replace(SMALL, model=model)
     params = init(jax.random.key(0), config)
@@ -214,6 +220,7 @@ def test_any_recipe_takes_the_reversible_encoder(model: str) -> None:
     assert bool(jnp.all(jnp.isfinite(out.logits)))
 
 
+@pytest.mark.slow
 def test_gradients_reach_the_trunk_unless_it_stays_as_drawn() -> None:
     labels, failed = jnp.arange(7) % 3, jnp.zeros((7, 2), bool)
 

@@ -75,7 +75,13 @@ def test_a_piece_that_ends_within_a_step_is_refused() -> None:
         encoder(SMALL.encoder, 18, "encoder")
 
 
-@pytest.mark.parametrize("model", ["baseline", "argate_l", "oracle", "embracenet"])
+@pytest.mark.parametrize(
+    "model",
+    [
+        "argate_l", "embracenet", pytest.param("baseline", marks=pytest.mark.slow),
+        pytest.param("oracle", marks=pytest.mark.slow),
+    ],
+)  # fmt: skip
 def test_any_recipe_takes_the_spiking_encoder(model: str) -> None:
     config = dataclasses.replace(SMALL, model=model)
     params = init(jax.random.key(0), config)

@@ -57,6 +57,7 @@ def test_a_run_leaves_numbers_and_pictures(
     assert [json.loads(line)["epoch"] for line in lines] == [1, 2]
 
 
+@pytest.mark.slow
 def test_a_run_folder_is_not_written_twice(run: tuple[Config, dict[str, Any]]) -> None:
     config, summary = run
     with pytest.raises(ValueError, match=r"already holds a run; pass --resume"):

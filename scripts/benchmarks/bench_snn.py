@@ -22,6 +22,7 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.records.snn_drift import drift_rows
+from snn_fusion_failure.records.snn_parts import WINDOWS, as_declared, by_hand, first_call
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
     provenance,
@@ -176,8 +177,6 @@ def _chain_speeds(programs: dict[str, Any], bench: Bench) -> dict[str, float]:
     """CPU time per robot-ms of chains of windows [us], by turns so that a busy phase hits all."""
     import jax
 
-    from snn_fusion_failure.records.snn_parts import WINDOWS
-
     keys = jax.random.split(jax.random.key(1), bench.block)
     held: dict[str, Any] = {}
     times: dict[str, list[float]] = {name: [] for name in programs}
@@ -194,24 +193,18 @@ def _chain_speeds(programs: dict[str, Any], bench: Bench) -> dict[str, float]:
 
 def time_parts(bench: Bench, whole: float) -> dict[str, float]:
     """Where the CPU time of a robot-ms goes [us]; `whole` is that of the closed loop."""
-    from snn_fusion_failure.records.snn_parts import by_hand
-
-    names = ("spikes", "neurons", "eligibility", "learning")
+    names = ("spikes", "neurons", "learning")
     took = _chain_speeds({n: by_hand(bench.block, bench.window, n) for n in names}, bench)
-    parts = {"random input spikes": took["spikes"]}
-    for name, (one, before) in {
-        "currents and neurons": ("neurons", "spikes"),
-        "eligibility": ("eligibility", "neurons"),
-        "change of the weights": ("learning", "eligibility"),
-    }.items():
-        parts[name] = took[one] - took[before]
+    parts = {
+        "random input spikes": took["spikes"],
+        "currents and neurons": took["neurons"] - took["spikes"],
+        "eligibility and change of the weights": took["learning"] - took["neurons"],
+    }
     return parts | {"world, rates, bookkeeping": whole - took["learning"], "whole": whole}
 
 
 def declared_share(bench: Bench) -> dict[str, float]:
     """Robot-ms per CPU-second of the network by hand and declared, without a world."""
-    from snn_fusion_failure.records.snn_parts import as_declared, by_hand
-
     took = _chain_speeds(
         {"by_hand": by_hand(bench.block, bench.window),
          "declared": as_declared(bench.block, bench.window)}, bench,
@@ -276,6 +269,8 @@ def main(bench: Bench) -> dict[str, Any]:
         f"declared, without a world: {out['declared']['declared']:.0f} robot-ms/s, "
         f"{out['declared']['ratio']:.2f} x the network by hand"
     )
+    out["first_call_cpu_s"] = first_call()
+    print(f"first call of run_experiment without a cache: {out['first_call_cpu_s']:.1f} CPU-s")
     out["memory_bytes_per_robot"] = memory_per_robot(bench)
     print("memory per robot [kB]:", {k: round(v / 1e3) for k, v in
                                      out["memory_bytes_per_robot"].items()})  # fmt: skip

@@ -2,11 +2,33 @@
 
 from __future__ import annotations
 
+import os
+import subprocess
+import sys
 from collections.abc import Callable
 from typing import Any
 
 WINDOWS = 16
 """Windows in a row in each program, so that its call costs nothing beside them."""
+_FIRST = """
+import time, jax, jaxsnn
+config, params = jaxsnn.preset("S4")
+map, keys = jaxsnn.scenario(1), jax.random.split(jax.random.key(0), 8)
+run = jax.jit(lambda k, p: jaxsnn.run_experiment(
+    config, jaxsnn.snn_params(config, p), map, keys=k, n_learn=1, n_test=1, max_steps=1))
+begin = time.process_time()
+jax.block_until_ready(run(keys, params).testing.status)
+print(time.process_time() - begin)
+"""
+
+
+def first_call() -> float:
+    """CPU time of the first call of `run_experiment` in a process without a compile cache [s]."""
+    env = {**os.environ, "JAX_ENABLE_COMPILATION_CACHE": "false"}
+    made = subprocess.run(
+        [sys.executable, "-c", _FIRST], env=env, check=True, capture_output=True, text=True
+    )
+    return float(made.stdout.split()[-1])
 
 
 def _s4(window: int) -> tuple[Any, Any]:
@@ -28,8 +50,8 @@ def by_hand(robots: int, window: int, part: str = "learning") -> tuple[Callable[
     Args:
         robots: how many at once.
         window: steps.
-        part: "spikes" (input spikes are drawn), "neurons" (and both layers run), "eligibility" (and
-            the eligibility is worked out) or "learning" (and the weights change).
+        part: "spikes" (input spikes are drawn), "neurons" (and both layers run) or "learning" (and
+            the weights change by their eligibility).
 
     Returns:
         `(states, keys) -> states` and the first states.
@@ -55,10 +77,6 @@ def by_hand(robots: int, window: int, part: str = "learning") -> tuple[Callable[
                 seen = state.baseline_hidden._replace(mean=spikes.hidden.mean(axis=0))
                 return state._replace(baseline_hidden=seen), None
             state, held, _ = network.window(config, params, kernel, state, pre)
-            if part == "eligibility":
-                # All of it has to be worked out, and nothing more.
-                seen = state.recent_turn + 1e-9 * held.hidden.sum() + 1e-9 * held.output.sum()
-                return state._replace(recent_turn=seen), None
             reward = _reward(held.output_count / held.duration)
             weights = network.reinforce(config, params, state.weights, held, reward)
             return state._replace(weights=weights), None

@@ -3,7 +3,8 @@
 The reading "literal" is the source wherever it speaks; what it leaves open (window, learning rate,
 time constant of the eligibility trace, threshold) has our values in both. "tuned" adds options;
 "guided" takes an input group for each interval, memory of the last turns and a graded reward for
-maps that need a detour; "way" is rewarded by a trainer that knows the way.
+maps that need a detour; "way" is rewarded by a trainer that knows the way; "critic" is "way" with a
+critic (`jaxsnn.critic`).
 `docs/snn_networks.md` says what each option does and how it was chosen.
 """
 
@@ -84,6 +85,10 @@ READINGS["way"] = {
     # Twice that of "guided": chosen on validation maps (results/study_snn_way_gamma.json).
     "params": {**READINGS["guided"]["params"], "gamma": 3e-4},
 }
+READINGS["critic"] = {
+    **READINGS["way"],
+    "config": {**READINGS["way"]["config"], "critic": "td"},
+}
 # Learning rates relative to that of S4. The additive rule moves a weight by mV and the
 # multiplicative one by a fraction, and inputs of S1 and S2 fire at 0.4 times the rate. "tuned":
 # best success in testing on Scenarios 1 and 2 (results/study_snn_gamma.json).
@@ -94,6 +99,7 @@ GAMMA = {
     # The best of three on a validation map (results/study_snn_way_gamma.json); S4 of exploration.
     "way": {"S1": 4.0, "S2": 4.0, "S3": 16.0, "S4": 1.0},
 }
+GAMMA["critic"] = GAMMA["way"]
 
 
 def preset(
@@ -109,7 +115,7 @@ def preset(
 
     Args:
         model: "S1", "S2", "S3" or "S4".
-        reading: "literal", "tuned", "guided" or "way".
+        reading: "literal", "tuned", "guided", "way" or "critic".
         config, params, stdp, reward: changes of single fields.
 
     Returns:

@@ -11,7 +11,7 @@ after the source's 20 learning trials (2,000 for Q-learning, about 10,000 for PP
 counts progress along the shortest way), `sr_testing_60_trials` with `--learn-trials 60`, and
 `path_ratio` of the trials that arrived. `S1` to `S4` are the reading "tuned", `S1_literal` to
 `S4_literal` the source's, `S4_guided` the one with a graded reward, `S4_way` the one whose trainer
-knows the way, as PPO's.
+knows the way, as PPO's, `S4_critic` that one with a critic.
 Networks use the seeds of the tables of record from 0 on. `--choose` trains on several maps of the
 training split, one after the other, and drives on maps of the validation split, which says what a
 map is worth as a teacher (`results/study_detour_choice.json`).
@@ -48,6 +48,7 @@ NETWORKS = (
     *("S1", "S2", "S3", "S4", "S4_guided", "S3_guided"),
     *("S1_literal", "S2_literal", "S3_literal", "S4_literal"),
     *("S1_way", "S2_way", "S3_way", "S4_way"),
+    *("S2_critic", "S4_critic"),
 )
 LEARNERS = ("q_learning", "ppo")
 UNITS = {"path_ratio": "1"}

@@ -39,7 +39,7 @@ V_DIODE = 0.7
 """Forward voltage of the body diodes, which carry what current is left [V]."""
 
 N_PULSES = 3
-"""Pulses that are computed; the first starts anywhere, every later one is alike."""
+"""Pulses that are computed; the first starts just above the trip, every later one is alike."""
 
 SPECS = (
     Spec("light_load_accuracy", "V", "max", "distance of the mean output from the reference"),
@@ -196,7 +196,8 @@ def solve_dcdc_light(
         r_low=edge.r_low,
         load=load * one,
     )
-    v = (schematic.V_REF + 2e-3) * one
+    # Beside the steady state: from far below the trip a pulse does not reach it.
+    v = pulse.v_trip + 2e-3
     mean, ripple = v, v
     for _ in range(N_PULSES):
         v, mean, ripple = pfm_cycle(pulse, v, points=points)

@@ -13,7 +13,7 @@ from snn_fusion_failure.runs import progress, write_json
 from snn_fusion_failure.runs.networks import changed_preset
 
 N_LEARN = 20
-Reading = Literal["tuned", "literal", "guided", "way"]
+Reading = Literal["tuned", "literal", "guided", "way", "critic"]
 
 
 @dataclasses.dataclass(frozen=True)

@@ -122,7 +122,7 @@ def plot_errors(
         axes.set_yscale("log")
         axes.set_ylim(0.9 * low, 1.1 * high)
         axes.set_title(title, fontsize=8)
-        axes.tick_params(labelsize=7)
+        axes.tick_params(which="both", labelsize=7)
         axes.set_xlabel("simulations", fontsize=7)
     for axes in list(panels):
         axes.set_visible(False)

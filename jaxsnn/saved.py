@@ -19,7 +19,7 @@ from jaxsnn import network
 from jaxsnn.config import NetworkConfig, NetworkParams
 from jaxsnn.network import NetworkState
 
-KEPT = ("weights", "baseline_input", "baseline_hidden", "updates", "critic", "n_sonars")
+KEPT = ("weights", "baseline_input", "baseline_hidden", "updates", "critic")
 
 
 def save_networks(path: str | Path, config: NetworkConfig, states: NetworkState) -> Path:

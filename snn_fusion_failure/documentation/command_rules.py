@@ -173,7 +173,7 @@ RULES = (
     Rule(
         "study_robustness.py",
         "--data runs/kitti --size tiny --seeds 1 --steps 1 --models dense "
-        "--kinds camera_blackout lidar_loss --levels 5 --any-size --results runs",
+        "--kinds camera_blackout lidar_loss --levels 5 --any-size --split val --results runs",
     ),
     Rule(
         "study_views.py",

@@ -79,6 +79,21 @@ RULES = (
         f"{_ROBOT} --models blind --rows 'weak motor' --trials 1",
         forget="results/study_lifelong.json",
     ),
+    Rule(
+        "study_snn.py critic --unseen",
+        f"{_ROBOT} --unseen 1 --only 'critic and potential alone'",
+        forget="results/study_snn_critic.json",
+    ),
+    Rule(
+        "study_snn.py critic",
+        f"{_ROBOT} --test-trials 1 --only 'critic and potential alone'",
+        forget="results/study_snn_critic.json",
+    ),
+    Rule(
+        "study_snn.py unseen",
+        f"{_ROBOT} --unseen 1 --only 'way, halves tied'",
+        forget="results/study_snn_unseen.json",
+    ),
     Rule("study_snn.py gamma", f"{_ROBOT} --test-trials 1", forget="results/study_snn_gamma.json"),
     Rule(
         "study_snn.py readings",
@@ -94,16 +109,6 @@ RULES = (
         "study_snn.py way_gamma",
         f"{_ROBOT} --test-trials 1 --only 'way, gamma 0.0003'",
         forget="results/study_snn_way_gamma.json",
-    ),
-    Rule(
-        "study_snn.py critic",
-        f"{_ROBOT} --unseen 1 --only 'critic and potential alone'",
-        forget="results/study_snn_critic.json",
-    ),
-    Rule(
-        "study_snn.py unseen",
-        f"{_ROBOT} --unseen 1 --only 'way, halves tied'",
-        forget="results/study_snn_unseen.json",
     ),
     Rule("figures_snn.py", "--scenarios 1"),
     Rule("compare_snn.py"),

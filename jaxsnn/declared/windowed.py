@@ -104,7 +104,7 @@ def window(
             # Signs go to the small side once, not to the spikes of every step.
             inner[name] = part, sign[:, None] * held
             continue
-        spikes = jnp.asarray(inputs[part.pre], dtype) * sign
+        spikes = jnp.asarray(inputs[part.pre], dtype) * sign[None]
         jumps[part.post] = jumps.get(part.post, 0.0) + spikes @ held
     currents = {n: jnp.asarray(inputs[n], dtype) for n in populations if n in inputs}
 

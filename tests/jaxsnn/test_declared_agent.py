@@ -148,7 +148,7 @@ def test_a_declared_network_learns_to_reach_the_target(form, least):
     """With its weights as drawn it hardly ever arrives; after a few trials nearly always.
 
     Weights that change once a window learn a little less: of 32 robots' trials 80 % arrive, and
-    87 % with weights that change at every step.
+    89 % with weights that change at every step.
     """
     net, keys = network(), jax.random.split(jax.random.key(1), 4)
     found = drive(net, keys, n_learn=12, form=form)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import abc
 import dataclasses
 import inspect
 from typing import Any, Literal
@@ -20,7 +21,7 @@ from fusion.lattice.quantiles import quantile_keypoints
 from fusion.lattice.subsets import random_features
 
 
-class _Estimator:
+class _Estimator(abc.ABC):
     """Settings are the arguments of `__init__`, what is learned has a trailing underscore."""
 
     def __init__(
@@ -129,8 +130,9 @@ class _Estimator:
         rows = jnp.asarray(_rows(x), jnp.float32)
         return np.asarray(premade.apply(self.config_, self.params_, rows), np.float64)
 
+    @abc.abstractmethod
     def _loss(self, found: jax.Array, goal: jax.Array) -> jax.Array:
-        raise NotImplementedError
+        """Of each row, from the model's output and what it should be."""
 
 
 def _rows(x: Any) -> np.ndarray:

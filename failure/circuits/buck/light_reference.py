@@ -14,17 +14,10 @@ import jax.numpy as jnp
 import numpy as np
 
 from failure.circuits.buck import light_load, schematic
-from failure.circuits.buck.reference import values_of
+from failure.circuits.buck.reference import OUTPUT_FILTER, SUPPLIES, values_of
 from failure.circuits.solver import ngspice
 from failure.circuits.solver.decks import sample_decks
-from failure.circuits.solver.netlist import (
-    Capacitor,
-    CurrentSource,
-    Mosfet,
-    Netlist,
-    Resistor,
-    VoltageSource,
-)
+from failure.circuits.solver.netlist import CurrentSource, Mosfet, Netlist
 
 _DRIVES = {"MD1": "dh", "MD2": "dh", "MD3": "dl", "MD4": "dl"}
 """Drivers whose input is the controller's, one for each side."""
@@ -44,13 +37,9 @@ def _rewired(m: Mosfet) -> Mosfet:
 FULL = Netlist(
     "buck converter, pulse-frequency mode",
     (
-        VoltageSource("Vdd", "vdd", "0", schematic.V_DD),
-        VoltageSource("Vnb", "nb", "0", schematic.V_BIAS),
-        VoltageSource("Vref", "ref", "0", schematic.V_REF),
+        *SUPPLIES,
         *(_rewired(m) for m in schematic.POWER_MOSFETS),
-        Resistor("Rcoil", "lx", "out", schematic.R_COIL),
-        Capacitor("Cout", "out", "oe", schematic.CAPACITANCE),
-        Resistor("Resr", "oe", "0", schematic.R_ESR),
+        *OUTPUT_FILTER,
         CurrentSource("Iload", "out", "0", light_load.LOAD),
     ),
 )

@@ -20,16 +20,23 @@ from failure.circuits.solver.netlist import (
 from failure.circuits.solver.system import compile_netlist
 from failure.circuits.solver.values import Values
 
+SUPPLIES = (
+    VoltageSource("Vdd", "vdd", "0", schematic.V_DD),
+    VoltageSource("Vnb", "nb", "0", schematic.V_BIAS),
+    VoltageSource("Vref", "ref", "0", schematic.V_REF),
+)
+OUTPUT_FILTER = (
+    Resistor("Rcoil", "lx", "out", schematic.R_COIL),
+    Capacitor("Cout", "out", "oe", schematic.CAPACITANCE),
+    Resistor("Resr", "oe", "0", schematic.R_ESR),
+)
+
 FULL = Netlist(
     "buck converter",
     (
-        VoltageSource("Vdd", "vdd", "0", schematic.V_DD),
-        VoltageSource("Vnb", "nb", "0", schematic.V_BIAS),
-        VoltageSource("Vref", "ref", "0", schematic.V_REF),
+        *SUPPLIES,
         *schematic.MOSFETS,
-        Resistor("Rcoil", "lx", "out", schematic.R_COIL),
-        Capacitor("Cout", "out", "oe", schematic.CAPACITANCE),
-        Resistor("Resr", "oe", "0", schematic.R_ESR),
+        *OUTPUT_FILTER,
         # The probe of the feedback pin: its 0.1 ns is left out of the cycle map.
         Resistor("Rfb", "out", "fb", 1e3),
         Capacitor("Cfb", "fb", "0", 1e-13),

@@ -27,7 +27,7 @@ from fusion.detection.geometry.encodings import (
     project_boxes,
     resolve_heading,
 )
-from fusion.detection.geometry.inside import points_in_boxes
+from fusion.detection.geometry.inside import in_footprints, points_in_boxes
 from fusion.detection.geometry.overlaps import (
     box3d_iou,
     ground_iou,
@@ -69,6 +69,7 @@ __all__ = [
     "ground_to_unit",
     "height_above",
     "image_iou",
+    "in_footprints",
     "nms",
     "pad_points",
     "pairwise",

@@ -30,6 +30,7 @@ from fusion.detection.learning.detection_loss import (
 )
 from fusion.detection.learning.examples import (
     Example,
+    camera_frame,
     frame_depth,
     make_example,
     make_inputs,
@@ -99,6 +100,7 @@ __all__ = [
     "average_cells",
     "balanced_class_loss",
     "box_overlaps",
+    "camera_frame",
     "class_loss",
     "class_losses",
     "class_precision",

@@ -25,6 +25,7 @@ from jaxtyping import Array, Bool, Float
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import wrap_angle
+from fusion.detection.geometry.inside import in_footprints
 from fusion.detection.geometry.planes import plane_y
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.lifting import grid_centres
@@ -57,12 +58,8 @@ def _mean_size(config: DetectorConfig) -> np.ndarray:
 
 def _inside_boxes(boxes: Array, mask: Array, x: Array, z: Array) -> Array:
     """Which cells' centres lie in the footprint of a box, half a metre around it included."""
-    dx, dz = (a[None] - boxes[:, i, None, None] for a, i in ((x, 0), (z, 2)))
-    c, s = (f(boxes[:, 6])[:, None, None] for f in (jnp.cos, jnp.sin))
-    along, across = jnp.abs(c * dx - s * dz), jnp.abs(s * dx + c * dz)
-    sides = 0.5 * boxes[:, 3:5, None, None] + _MARGIN
-    within = (along < sides[:, 0]) & (across < sides[:, 1])
-    return (within & mask[:, None, None]).any(axis=0)
+    inside = in_footprints(x.ravel(), z.ravel(), boxes, margin=_MARGIN) & mask[None]
+    return inside.any(axis=1).reshape(x.shape)
 
 
 def _inside_regions(

@@ -7,7 +7,7 @@ fail differently each time that the frame is seen.
 from __future__ import annotations
 
 from collections.abc import Sequence
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -197,10 +197,15 @@ def stack_examples(examples: Sequence[Example]) -> Example:
     return Example(*(np.stack(column) for column in zip(*examples, strict=True)))
 
 
+def camera_frame(points: Any, to_camera: Any) -> Float[Array, "p 3"]:
+    """Points of a scan `[p, 3 or more]` in the camera frame, by `[3, 4]` rotation and shift."""
+    matrix = jnp.asarray(to_camera)
+    return jnp.asarray(points)[:, :3] @ matrix[:, :3].T + matrix[:, 3][None]
+
+
 def frame_depth(config: DetectorConfig, example: Example) -> Float[Array, "h w"]:
     """Distance of what each pixel of the frame's resized image shows [m], inside jit."""
-    to_camera = jnp.asarray(example.to_camera)
-    camera = jnp.asarray(example.points)[:, :3] @ to_camera[:, :3].T + to_camera[:, 3][None]
+    camera = camera_frame(example.points, example.to_camera)
     mask, p2 = jnp.asarray(example.point_mask), jnp.asarray(example.p2)
     size, plane = jnp.asarray(example.image_size), jnp.asarray(example.plane)
     return depth_image(config.image_size, camera, mask, p2, size, plane)
@@ -233,8 +238,7 @@ def make_inputs(
     if image is None:
         image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
     cloud, mask = points if points is not None else (example.points, example.point_mask)
-    to_camera = jnp.asarray(example.to_camera)
-    camera = jnp.asarray(cloud)[:, :3] @ to_camera[:, :3].T + to_camera[:, 3][None]
+    camera = camera_frame(cloud, example.to_camera)
     p2, plane, truth = (jnp.asarray(a) for a in (example.p2, example.plane, example.truth))
     size = jnp.asarray(example.image_size)
     if mirror is not None:

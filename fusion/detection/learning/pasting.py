@@ -26,16 +26,11 @@ from fusion.detection.geometry.encodings import box_corners, ground_box, project
 from fusion.detection.geometry.inside import points_in_boxes
 from fusion.detection.geometry.overlaps import image_iou, rotated_intersection
 from fusion.detection.geometry.planes import plane_y
-from fusion.detection.learning.examples import Example
+from fusion.detection.learning.examples import Example, camera_frame
 
 _MARGIN = 0.2  # around a box within which a point belongs to its car [m]
 _APART = 0.3  # least distance between pasted and other boxes, each side [m]
 _HIDDEN = 0.1  # share of a box's rectangle that another one may cover
-
-
-def _camera_frame(example: Example) -> Array:
-    to_camera = jnp.asarray(example.to_camera)
-    return jnp.asarray(example.points)[:, :3] @ to_camera[:, :3].T + to_camera[:, 3][None]
 
 
 def _rectangles(example: Example, boxes: Array) -> Array:
@@ -112,7 +107,7 @@ def _paste_points(
     example: Example, other: Example, boxes: Array, landed: Array, pasted: Array, shift: Array
 ) -> tuple[Float[Array, "p 4"], Bool[Array, "p"]]:
     """The scan without what the pasted objects cover, and their own points before it."""
-    camera = _camera_frame(example)
+    camera = camera_frame(example.points, example.to_camera)
     kept = jnp.asarray(example.point_mask)
     in_box = points_in_boxes(camera, landed, margin=_MARGIN)
     p2, size = jnp.asarray(example.p2), jnp.asarray(example.image_size)
@@ -123,7 +118,7 @@ def _paste_points(
     behind = behind.all(axis=-1) & (camera[:, 2:] > landed[None, :, 2])
     kept = kept & ~((in_box | behind) & pasted[None]).any(axis=1)
 
-    theirs = _camera_frame(other)
+    theirs = camera_frame(other.points, other.to_camera)
     own = points_in_boxes(theirs, boxes, margin=_MARGIN) & pasted[None]
     moved = theirs.at[:, 1].add(jnp.where(own, shift[None], 0.0).sum(axis=1))
     to_camera = jnp.asarray(example.to_camera)

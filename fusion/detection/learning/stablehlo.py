@@ -14,7 +14,7 @@ from jaxtyping import Array, Bool, Float, UInt8
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.learning.dense_objective import dense_detect
-from fusion.detection.learning.examples import Example, make_inputs
+from fusion.detection.learning.examples import Example, camera_frame, make_inputs
 from fusion.detection.learning.inference import detect
 from fusion.detection.learning.training import DetectorState
 from fusion.detection.network.proposals import Detections
@@ -36,7 +36,7 @@ def _seen(
 ) -> Bool[Array, "n"]:
     """Points in the picture and, with a metre more, in the area, as `make_example` keeps them."""
     there = jnp.isfinite(points).all(axis=1)
-    camera = points[:, :3] @ to_camera[:, :3].T + to_camera[:, 3][None]
+    camera = camera_frame(points, to_camera)
     u, v, depth = (camera @ p2[:, :3].T + p2[:, 3][None]).T
     u, v = u / depth, v / depth
     seen = (depth > 0) & (u >= 0) & (u < size[1]) & (v >= 0) & (v < size[0])

@@ -3,6 +3,7 @@
     python scripts/studies/study_snn.py --study readings --seeds 8 --scenario 2
     python scripts/studies/study_snn.py --study gamma --model S2 --seeds 8 --max-minutes 30
     python scripts/studies/study_snn.py --study way --map detour/validation/0
+    python scripts/studies/study_snn.py --study tau_z --reading way --map detour/validation/2
     python scripts/studies/study_snn.py --study critic --map detour/train/0 --unseen 20
 
 Every variant is a reading with a few changes, run over the same seeds on a training scenario or a
@@ -56,13 +57,6 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         "tuned, angle code as listed": ("tuned", ("config.angle_code=listed",)),
         "tuned, soft bounds": ("tuned", ("config.bounds=soft",)),
     },
-    "gamma": {
-        f"tuned, gamma {g:g}": ("tuned", (f"params.gamma={g}",))
-        for g in (5e-5, 1.5e-4, 4.5e-4, 1.35e-3, 4e-3)
-    },
-    "goal": {
-        f"tuned, goal {g} degrees": ("tuned", (f"reward.goal_angle={g}",)) for g in (30, 45, 60, 90)
-    },
     # For maps that need a detour: one part of the reading "way" at a time taken out or changed.
     "way": {
         "way": ("way", ()),
@@ -80,10 +74,6 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         "guided (rule of all sonars)": ("guided", ()),
         "way, rewards by the nearest obstacle": ("way", ("config.guidance=nearest",)),
         "tuned": ("tuned", ()),
-    },
-    "way_gamma": {
-        f"way, gamma {g:g}": ("way", (f"params.gamma={g}",))
-        for g in (1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 4.8e-3)
     },
     # The reward's end of step by its potential and by a critic's error, beside the trainer's reward
     # and in its place.
@@ -118,25 +108,26 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
             ("config.mirror=true", "params.gamma=6e-4", "config.starts=anywhere"),
         ),
     },
-    "tau_z": {
-        f"tuned, tau_z {t:g} s": ("tuned", (f"stdp.tau_z={t}",)) for t in (0.01, 0.025, 0.1, 0.3)
+}
+# One constant at a time around a reading: study -> what the name says after the reading -> changes.
+CONSTANTS: dict[str, dict[str, tuple[str, ...]]] = {
+    "gamma": {
+        f"gamma {g:g}": (f"params.gamma={g}",) for g in (5e-5, 1.5e-4, 4.5e-4, 1.35e-3, 4e-3)
     },
+    "way_gamma": {
+        f"gamma {g:g}": (f"params.gamma={g}",) for g in (1.5e-4, 3e-4, 6e-4, 1.2e-3, 2.4e-3, 4.8e-3)
+    },
+    "goal": {f"goal {g} degrees": (f"reward.goal_angle={g}",) for g in (30, 45, 60, 90)},
+    "tau_z": {f"tau_z {t:g} s": (f"stdp.tau_z={t}",) for t in (0.01, 0.025, 0.05, 0.1, 0.3)},
     "homeostasis": {
-        f"tuned, homeostasis {h:g}/s": ("tuned", (f"params.homeostasis={h}",))
-        for h in (0.001, 0.005, 0.02, 0.05)
+        f"homeostasis {h:g}/s": (f"params.homeostasis={h}",) for h in (0, 0.001, 0.005, 0.02, 0.05)
     },
     "rates": {
-        f"tuned, rates {h:g}/{o:g} Hz": (
-            "tuned",
-            (f"params.rate_hidden={h}", f"params.rate_output={o}"),
-        )
+        f"rates {h:g}/{o:g} Hz": (f"params.rate_hidden={h}", f"params.rate_output={o}")
         for h, o in ((10, 40), (25, 40), (25, 60), (25, 100), (50, 60))
     },
     "window": {
-        f"tuned, control {c} ms, held {h} ms": (
-            "tuned",
-            (f"config.control_steps={c}", f"config.hold_steps={h}"),
-        )
+        f"control {c} ms, held {h} ms": (f"config.control_steps={c}", f"config.hold_steps={h}")
         for c, h in ((100, 100), (200, 50), (200, 100), (200, 200), (400, 100))
     },
 }
@@ -159,6 +150,8 @@ class Study:
         "critic",
         "unseen",
     ] = "readings"
+    reading: Literal["tuned", "way"] = "tuned"
+    """Around which reading a constant is changed; `way_gamma` is the rate of "way" alone."""
     model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
     scenario: Literal[1, 2, 3] = 1
     map: str | None = None
@@ -175,6 +168,17 @@ class Study:
     """Names of variants; all by default."""
     max_minutes: float = 30.0
     """No variant is begun after so many minutes of CPU time."""
+
+
+def variants_of(config: Study) -> dict[str, tuple[str, tuple[str, ...]]]:
+    """Variant -> (reading, changes) of a study."""
+    if config.study in STUDIES:
+        return STUDIES[config.study]
+    reading = "way" if config.study == "way_gamma" else config.reading
+    return {
+        f"{reading}, {label}": (reading, changes)
+        for label, changes in CONSTANTS[config.study].items()
+    }
 
 
 def _seeds(config: Study) -> list[int]:
@@ -218,7 +222,7 @@ def main(config: Study) -> dict[str, Any]:
         raise ValueError(f"map={config.map!r}: expected a map of the split validation or train")
     if config.unseen and (config.map or "").split("/")[1:2] != ["train"]:
         raise ValueError(f"map={config.map!r}: expected a map of the split train with --unseen")
-    variants = STUDIES[config.study]
+    variants = variants_of(config)
     map = scenarios.scenario(config.scenario) if config.map is None else named_map(config.map)
     unknown = set(config.only) - set(variants)
     if unknown:

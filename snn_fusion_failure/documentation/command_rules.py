@@ -94,6 +94,24 @@ RULES = (
         f"{_ROBOT} --unseen 1 --only 'way, halves tied'",
         forget="results/study_snn_unseen.json",
     ),
+    *(
+        Rule(
+            f"study_snn.py {study} way",
+            f"{_ROBOT} --test-trials 1 --only 'way, {only}'",
+            forget=f"results/study_snn_{study}.json",
+        )
+        for study, only in (
+            ("tau_z", "tau_z 0.1 s"),
+            ("homeostasis", "homeostasis 0.02/s"),
+            ("rates", "rates 25/40 Hz"),
+            ("window", "control 400 ms, held 100 ms"),
+        )
+    ),
+    Rule(
+        "study_snn.py goal",
+        f"{_ROBOT} --test-trials 1 --only 'tuned, goal 45 degrees'",
+        forget="results/study_snn_goal.json",
+    ),
     Rule("study_snn.py gamma", f"{_ROBOT} --test-trials 1", forget="results/study_snn_gamma.json"),
     Rule(
         "study_snn.py readings",

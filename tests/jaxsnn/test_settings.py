@@ -10,7 +10,7 @@ from jaxsnn.scores import score, success
 from snn_fusion_failure.runs.networks import changed_preset
 from tests._scripts import load_script
 
-STUDIES = load_script("studies/study_snn").STUDIES
+STUDY = load_script("studies/study_snn")
 
 
 @pytest.mark.parametrize("reading", sorted(READINGS))
@@ -55,9 +55,20 @@ def test_unknown_reading_is_named():
 
 
 def test_every_variant_of_every_study_builds():
-    for variants in STUDIES.values():
-        for reading, changes in variants.values():
-            check_network(*changed_preset("S4", reading, changes))
+    for name in (*STUDY.STUDIES, *STUDY.CONSTANTS):
+        for reading in ("tuned", "way"):
+            config = STUDY.Study(study=name, reading=reading)
+            for of, changes in STUDY.variants_of(config).values():
+                check_network(*changed_preset("S4", of, changes))
+
+
+def test_a_constant_is_changed_around_the_reading_that_is_asked_for():
+    tuned, way = (
+        STUDY.variants_of(STUDY.Study(study="tau_z", reading=reading))
+        for reading in ("tuned", "way")
+    )
+    assert tuned["tuned, tau_z 0.1 s"] == ("tuned", ("stdp.tau_z=0.1",))
+    assert way["way, tau_z 0.1 s"] == ("way", ("stdp.tau_z=0.1",))
 
 
 def test_metrics_count_arrivals_only():

@@ -29,6 +29,7 @@ from typing import Any
 
 from snn_fusion_failure.documentation import command_rules, documented, sample_data
 from snn_fusion_failure.documentation.executing import Done, run_area
+from snn_fusion_failure.documentation.rule import Rule
 from snn_fusion_failure.runs import repository, write_text
 
 CHECKED = ("results", "docs", "README.md")
@@ -51,7 +52,7 @@ class Config:
     """Make the copy here and leave it, with a log for each command."""
 
 
-def missing(rule: command_rules.Rule) -> str:
+def missing(rule: Rule) -> str:
     """The program or package that a command needs and that is not here, in words."""
     name = rule.needs
     if not name or shutil.which(name) or importlib.util.find_spec(name):

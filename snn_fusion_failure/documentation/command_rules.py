@@ -2,32 +2,10 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-
-@dataclasses.dataclass(frozen=True)
-class Rule:
-    """How a documented command is run.
-
-    Attributes:
-        words: it is meant for commands that have all of these words; the first rule counts.
-        small: options that are appended.
-        not_run: why it is not run at all.
-        needs: a program or a Python package that has to be there.
-        forget: a file of the copy that would let the command find its work done.
-        held: a file of the copy and its text, which save a search for what nobody looks at.
-    """
-
-    words: str
-    small: str = ""
-    not_run: str = ""
-    needs: str = ""
-    forget: str = ""
-    held: tuple[str, str] | None = None
-
+from snn_fusion_failure.documentation.robot_rules import ROBOTS
+from snn_fusion_failure.documentation.rule import Rule
 
 _TORCH = "compares with PyTorch, which the tests do not install (extra `bench`)"
-_ROBOT = "--seeds 1 --max-steps 3"
 _HAR = "--preset quick --seeds 1 --models baseline --shard 0/12 --out runs/tables"
 _SEARCH = "--seeds 1 --threshold 1 --overwrite"
 _STUDY = (
@@ -61,80 +39,7 @@ RULES = (
     Rule("sweep.py show runs/mine", not_run="shows the sweep of the reader's own module"),
     Rule("pip install", not_run="installs; the Makefile does it"),
     Rule("pytest", not_run="is part of the test suite"),
-    # Chapter 2.
-    Rule("train_snn.py", f"{_ROBOT} --preset quick --overwrite"),
-    Rule("study_transfer.py", f"{_ROBOT} --maps 1 --test-trials 1 --scenarios 1 --checkpoints 20"),
-    Rule(
-        "study_detour.py",
-        f"{_ROBOT} --models blind --rows D1 --test-trials 1",
-        forget="results/study_detour.json",
-    ),
-    Rule(
-        "study_guidance.py",
-        "--samples 2 --maps 1 --test-maps 1 --robots 1 --trials 1",
-        forget="results/study_guidance.json",
-    ),
-    Rule(
-        "study_lifelong.py",
-        f"{_ROBOT} --models blind --rows 'weak motor' --trials 1",
-        forget="results/study_lifelong.json",
-    ),
-    Rule(
-        "study_snn.py critic --unseen",
-        f"{_ROBOT} --unseen 1 --only 'critic and potential alone'",
-        forget="results/study_snn_critic.json",
-    ),
-    Rule(
-        "study_snn.py critic",
-        f"{_ROBOT} --test-trials 1 --only 'critic and potential alone'",
-        forget="results/study_snn_critic.json",
-    ),
-    Rule(
-        "study_snn.py unseen",
-        f"{_ROBOT} --unseen 1 --only 'way, halves tied'",
-        forget="results/study_snn_unseen.json",
-    ),
-    *(
-        Rule(
-            f"study_snn.py {study} way",
-            f"{_ROBOT} --test-trials 1 --only 'way, {only}'",
-            forget=f"results/study_snn_{study}.json",
-        )
-        for study, only in (
-            ("tau_z", "tau_z 0.1 s"),
-            ("homeostasis", "homeostasis 0.02/s"),
-            ("rates", "rates 25/40 Hz"),
-            ("window", "control 400 ms, held 100 ms"),
-        )
-    ),
-    Rule(
-        "study_snn.py goal",
-        f"{_ROBOT} --test-trials 1 --only 'tuned, goal 45 degrees'",
-        forget="results/study_snn_goal.json",
-    ),
-    Rule("study_snn.py gamma", f"{_ROBOT} --test-trials 1", forget="results/study_snn_gamma.json"),
-    Rule(
-        "study_snn.py readings",
-        f"{_ROBOT} --test-trials 1 --only tuned",
-        forget="results/study_snn_readings.json",
-    ),
-    Rule(
-        "study_snn.py way",
-        f"{_ROBOT} --test-trials 1 --only tuned",
-        forget="results/study_snn_way.json",
-    ),
-    Rule(
-        "study_snn.py way_gamma",
-        f"{_ROBOT} --test-trials 1 --only 'way, gamma 0.0003'",
-        forget="results/study_snn_way_gamma.json",
-    ),
-    Rule("figures_snn.py", "--scenarios 1"),
-    Rule("compare_snn.py"),
-    Rule(
-        "bench_snn.py",
-        "--robots 1 --block 1 --control-steps 1 --repeats 1 --no-accuracy --memory-robots 2",
-    ),
-    Rule("train_rl.py", "--seeds 1 --scenarios 1 --test-trials 1 --max-steps 5 --overwrite"),
+    *ROBOTS,
     # Chapter 3.
     Rule("train_argate.py simulated", "--epochs 1 --overwrite"),
     Rule("train_argate.py", "--epochs 1 --preset quick --overwrite"),

@@ -13,7 +13,8 @@ import re
 import shlex
 from pathlib import Path
 
-from snn_fusion_failure.documentation.command_rules import AREAS, PLACEHOLDERS, RULES, Rule
+from snn_fusion_failure.documentation.command_rules import AREAS, PLACEHOLDERS, RULES
+from snn_fusion_failure.documentation.rule import Rule
 from snn_fusion_failure.runs import repository
 
 ROOT = repository.ROOT

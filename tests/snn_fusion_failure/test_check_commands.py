@@ -9,8 +9,9 @@ from pathlib import Path
 import pytest
 
 from snn_fusion_failure.documentation import check_commands, documented, executing
-from snn_fusion_failure.documentation.command_rules import RULES, Rule
+from snn_fusion_failure.documentation.command_rules import RULES
 from snn_fusion_failure.documentation.documented import Command
+from snn_fusion_failure.documentation.rule import Rule
 from snn_fusion_failure.runs import repository
 
 COMMANDS = documented.documented()

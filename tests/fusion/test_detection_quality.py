@@ -118,7 +118,7 @@ def test_what_tells_noisy_ranges_and_blur_moves_as_far_as_other_statistics_do() 
 
 def test_statistics_pass_no_gradient_and_labels_count_where_they_are_known() -> None:
     image, bev = jnp.ones((2, 32, 96, 3)), jnp.ones((2, *BEV.shape, 6))
-    slope = jax.grad(lambda x: quality_statistics(BEV, x, bev).sum())(image)
+    slope = jax.grad(lambda x: quality_statistics(BEV, x, bev)[0].sum())(image)
     assert float(jnp.abs(slope).max()) == 0.0
     logits, failed = jnp.array([[2.0, -1.0], [0.0, jnp.nan]]), jnp.array([[True, False]] * 2)
     expected = (np.log1p(np.exp(-2.0)) + np.log1p(np.exp(-1.0)) + np.log(2)) / 4

@@ -13,6 +13,7 @@ from fusion.detection.learning.cache import (
     write_example,
 )
 from fusion.detection.learning.checkpoints import Checkpoints
+from fusion.detection.learning.clean_readings import with_clean_readings
 from fusion.detection.learning.dense_objective import dense_detect, dense_loss, grid_losses
 from fusion.detection.learning.dense_targets import (
     GridTargets,
@@ -149,5 +150,6 @@ __all__ = [
     "training_inputs",
     "turn_and_scale",
     "weight_auroc",
+    "with_clean_readings",
     "write_example",
 ]

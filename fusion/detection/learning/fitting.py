@@ -19,6 +19,7 @@ import numpy as np
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.learning.checkpoints import Checkpoints
+from fusion.detection.learning.clean_readings import with_clean_readings
 from fusion.detection.learning.dense_objective import dense_detect
 from fusion.detection.learning.examples import Example, make_inputs, stack_examples
 from fusion.detection.learning.inference import detect
@@ -139,6 +140,9 @@ def fit_detector(
                 "empty folder"
             )
         start, state, history = held
+    else:
+        clean_key = jax.random.fold_in(key, 2)
+        state = with_clean_readings(config, train, state, n_frames, read, key=clean_key)
     advance, rates = _step(config, train), params.as_arrays()
     step_key = jax.random.fold_in(key, 1)
 

@@ -27,7 +27,14 @@ from fusion.detection.network.forward import (
     score_proposals,
 )
 from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
-from fusion.detection.network.heads import GridGate, MapGate, QualityHead, RpnHead, SecondHead
+from fusion.detection.network.heads import (
+    CleanReadings,
+    GridGate,
+    MapGate,
+    QualityHead,
+    RpnHead,
+    SecondHead,
+)
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.lifting import grid_centres, lift
@@ -45,6 +52,7 @@ __all__ = [
     "GROUP_SIZE",
     "N_OUTPUTS",
     "AuxiliaryHeads",
+    "CleanReadings",
     "DenseAuxiliary",
     "DenseDetector",
     "Detections",

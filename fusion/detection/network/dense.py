@@ -24,7 +24,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 from fusion.detection.config import DetectorConfig
 from fusion.detection.network.detector import teach_if_alive
 from fusion.detection.network.group_norm import group_norm_relu
-from fusion.detection.network.heads import GridGate, QualityHead
+from fusion.detection.network.heads import CleanReadings, GridGate, QualityHead
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.lifting import lift
@@ -113,6 +113,8 @@ class DenseDetector(nn.Module):
         self.joined, self.lifted = block(half), block(half, size=1)
         if c.weighs:
             self.gate = GridGate(c.gate_width, c.normalizer)
+            if c.gate_statistics:
+                self.clean = CleanReadings()
             if c.gated and c.gate_statistics:
                 self.quality = QualityHead(c.gate_width)
         top, low = d.trunk_widths
@@ -145,7 +147,7 @@ class DenseDetector(nn.Module):
         views = jax.lax.stop_gradient((camera, lidar))
         statistics = None
         if self.config.gate_statistics:
-            statistics = quality_statistics(self.config.bev, inputs.image, inputs.bev)
+            statistics = self.clean(quality_statistics(self.config.bev, inputs.image, inputs.bev))
         if self.config.is_oracle:
             return Grids(camera, lidar, self.gate(views, statistics, _told(inputs.told)), failed)
         if statistics is None:

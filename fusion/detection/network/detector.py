@@ -16,7 +16,7 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.network.crop import crop_and_resize
-from fusion.detection.network.heads import MapGate, QualityHead, RpnHead, SecondHead
+from fusion.detection.network.heads import CleanReadings, MapGate, QualityHead, RpnHead, SecondHead
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.views import FeaturePyramid
 from fusion.detection.sensors.quality import quality_statistics
@@ -63,6 +63,7 @@ class Detector(nn.Module):
         if c.gated:
             self.gate = MapGate(c.gate_width, c.normalizer)
             if c.gate_statistics:
+                self.clean = CleanReadings()
                 self.quality = QualityHead(c.gate_width)
         self.rpn = RpnHead(c.rpn_width, c.dropout)
         self.second = SecondHead(c.fc_widths, c.dropout)
@@ -79,7 +80,7 @@ class Detector(nn.Module):
             return Encoded((camera, lidar), maps, jnp.full((image.shape[0], 2), 0.5), failed)
         if not self.config.gate_statistics:
             return Encoded((camera, lidar), maps, self.gate(maps), failed)
-        statistics = quality_statistics(self.config.bev, image, bev)
+        statistics = self.clean(quality_statistics(self.config.bev, image, bev))
         failed = self.quality(statistics)
         return Encoded((camera, lidar), maps, self.gate(maps, statistics, failed), failed)
 

@@ -7,6 +7,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from fusion.detection.sensors.deviation import Clean, deviations
 from fusion.gating import Normalizer, normalize
 
 _LEAK = 0.1
@@ -40,8 +41,27 @@ class RpnHead(nn.Module):
         return outputs[0], outputs[1]
 
 
+class CleanReadings(nn.Module):
+    """How far a frame's statistics lie from those of clean training frames, sensor by sensor.
+
+    Its numbers are fitted before training (`with_clean_readings`) and no gradient reaches them;
+    until then they compare with nothing, mean 0 and deviation 1.
+    """
+
+    @nn.compact
+    def __call__(self, statistics: tuple[Array, ...]) -> Float[Array, "b n"]:
+        """`deviations` of all sensors, in their order."""
+        found = []
+        for sensor, given in zip(("camera", "lidar"), statistics, strict=True):
+            n = given.shape[-1]
+            mean = self.param(f"{sensor}_mean", nn.initializers.zeros, (n,))
+            whiten = self.param(f"{sensor}_whiten", lambda _, shape: jnp.eye(shape[0]), (n, n))
+            found.append(deviations(Clean(mean, whiten), given))
+        return jnp.concatenate(found, axis=-1)
+
+
 class QualityHead(nn.Module):
-    """Logits of each sensor's failure from the statistics of the raw readings."""
+    """Logits of each sensor's failure from the deviations of its readings."""
 
     width: int
 
@@ -59,7 +79,7 @@ class MapGate(nn.Module):
         \ell\big] + b_o\Big)
 
     :math:`p_k` are mean and standard deviation over the map of view k after two strided
-    convolutions, :math:`q` the statistics of the raw readings (`quality_statistics`),
+    convolutions, :math:`q` the deviations of the raw readings (`CleanReadings`),
     :math:`\ell` the log odds of failures that `QualityHead` reads from them, :math:`N` the
     normalizer; rectifiers are leaky, since a gate whose few units have died weighs all frames
     alike. `init_detector` starts the last layer at zero, that is from equal weights, as AVOD fuses.

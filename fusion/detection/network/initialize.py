@@ -38,7 +38,8 @@ def init_weights(
             output layers.
 
     Returns:
-        `{"params": ..., ...}`; kernels as drawn, scales and variances one, all else zero.
+        `{"params": ..., ...}`; kernels as drawn, scales and variances one, whitening matrices the
+        identity, all else zero.
     """
     scales = scales or {}
     shapes = jax.eval_shape(lambda k: module.lazy_init(k, *inputs), key)
@@ -53,6 +54,8 @@ def init_weights(
             fan_in = math.prod(leaf.shape[:-1])
             sd = scales.get(name[-2], math.sqrt(2.0 / fan_in))
             out.append(sd * noise[end - size : end].reshape(leaf.shape))
+        elif name[-1].endswith("_whiten"):
+            out.append(jnp.eye(leaf.shape[0], dtype=leaf.dtype))
         else:
             one = name[-1] in ("scale", "var")
             # An explicit dtype: a weak one would change after the first step, and compile it again.

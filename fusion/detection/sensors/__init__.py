@@ -7,6 +7,7 @@ from fusion.detection.sensors.camera_failures import (
     random_camera_failure,
 )
 from fusion.detection.sensors.depth import FARTHEST, depth_image
+from fusion.detection.sensors.deviation import Clean, deviations, fit_clean
 from fusion.detection.sensors.hdl64 import AZIMUTH_STEP, ELEVATIONS, N_BEAMS, RANGE_NOISE, beam_of
 from fusion.detection.sensors.lidar_failures import (
     LIDAR_FAILURES,
@@ -36,6 +37,7 @@ __all__ = [
     "N_SCAN",
     "RANGE_NOISE",
     "CameraFailure",
+    "Clean",
     "LidarFailure",
     "Misalignment",
     "Severity",
@@ -43,6 +45,8 @@ __all__ = [
     "camera_failure",
     "check_failure",
     "depth_image",
+    "deviations",
+    "fit_clean",
     "image_statistics",
     "lidar_failure",
     "misaligned",

@@ -119,7 +119,7 @@ def scan_statistics(config: BevConfig, bev: Float[Array, "b r c s"]) -> Float[Ar
 
 def quality_statistics(
     config: BevConfig, image: Float[Array, "b h w 3"], bev: Float[Array, "b r c s"]
-) -> Float[Array, "b n"]:
-    """Statistics of both sensors, the camera's first; without gradient."""
-    both = [image_statistics(image), scan_statistics(config, bev)]
-    return jax.lax.stop_gradient(jnp.concatenate(both, axis=-1))
+) -> tuple[Float[Array, "b n"], Float[Array, "b m"]]:
+    """Statistics of camera and lidar; without gradient."""
+    both = image_statistics(image), scan_statistics(config, bev)
+    return jax.lax.stop_gradient(both)

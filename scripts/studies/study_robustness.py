@@ -40,6 +40,7 @@ from snn_fusion_failure.commands.detector_cells import (
     read_frames,
 )
 from snn_fusion_failure.commands.detector_robustness import summarize_cells
+from snn_fusion_failure.records.detector_folds import FOLDS
 from snn_fusion_failure.records.rows import Compared, column_cells, record_table
 from snn_fusion_failure.runs import print_result, repository, run_command
 
@@ -49,12 +50,6 @@ MODELS: tuple[choices.Model, ...] = (
 BASELINE: choices.Model = "dense"
 SINGLE = {"camera_only": (1.0, 0.0), "lidar_only": (0.0, 1.0)}
 """Detectors of one sensor, made from the trained baseline by fixed fusion weights."""
-FOLDS = (
-    ("camera_noise", "camera_fog", "lidar_loss"),
-    ("camera_blackout", "lidar_noise", "lidar_sector_dropout"),
-    ("camera_blur", "camera_exposure", "lidar_beam_loss"),
-)
-"""Kinds that are left out of the training together; each group has both sensors."""
 Fold = Literal["none", "0", "1", "2", "seed"]
 METRICS = (METRIC, "weight_auroc", "failed_auroc")
 GROUPS = (

@@ -83,6 +83,10 @@ RULES = (
     Rule("simulate_kitti.py --picture", "--size tiny"),
     Rule("simulate_kitti.py", "--frames 2 --val 2 --test 2 --size tiny"),
     Rule("study_geometry.py", "--frames 2 --any-size"),
+    Rule(
+        "study_quality.py",
+        "--data runs/kitti --size tiny --split val --frames 3 --steps 4 --seeds 1",
+    ),
     Rule("study_anchors.py", "--data runs/kitti --size tiny --frames 2"),
     Rule(
         "draw_detections.py",
@@ -204,7 +208,7 @@ AREAS = {
     "detector": (
         "simulate_kitti", "train_detector", "evaluate_kitti", "study_detector", "study_geometry",
         "study_robustness",
-        "study_views", "study_anchors",
+        "study_views", "study_anchors", "study_quality",
         "draw_detections", "bench_detector", "bench_kitti_eval",
     ),
     "robots": (

@@ -101,6 +101,16 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
     # What a network of one map knows of others: more situations in as many trials.
     "unseen": {
         "way": ("way", ()),
+        "way, no homeostasis": ("way", ("params.homeostasis=0",)),
+        "way, no homeostasis, not annealed": ("way", ("params.homeostasis=0", "params.anneal=1e9")),
+        "way, no homeostasis, not centred": (
+            "way",
+            ("params.homeostasis=0", "params.centring=0"),
+        ),
+        "way, no homeostasis, twice the rate": (
+            "way",
+            ("params.homeostasis=0", "params.gamma=6e-4"),
+        ),
         "way, halves tied": ("way", ("config.mirror=true", "params.gamma=6e-4")),
         "way, starts anywhere": ("way", ("config.starts=anywhere",)),
         "way, halves tied, starts anywhere": (

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Key
 from failure.descents import Descent, by_gradients, by_values
 from failure.estimates import GOOD, Estimate, check_threshold, mean_of_terms
 from failure.models.emulator import Emulator
+from failure.opposite import OPPOSITE, opposite_side_fails
 from failure.performances import Counted, Performance, Slopes
 
 BAND = 2.0
@@ -63,7 +64,8 @@ def ak_sampling(
     gradients only, and what the others do is its noise; without, all parameters.
 
     The verdict is not "good" when the budget ends first, when simulations have come out far from
-    what was predicted for them, and when the design point was not reached.
+    what was predicted for them, when the design point was not reached, and when the side opposite
+    to it fails as well.
 
     Args:
         performance: `x [n, D] -> y [n]`, larger is worse.
@@ -144,6 +146,10 @@ def ak_sampling(
             "predicted: the emulator is wrong about its error; use line_sampling"
         )
         lower, upper = 0.0, 1.0
+    if opposite_side_fails(performance, threshold, u / np.linalg.norm(u), float(np.linalg.norm(u))):
+        reasons.append(OPPOSITE)
+        upper = 1.0
+    spent += 1
     if effective < 10.0:
         reasons.append(f"only {effective:.1f} effective members of the population")
         lower, upper = 0.0, 1.0

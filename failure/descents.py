@@ -101,14 +101,21 @@ def by_gradients(
 
 
 def by_values(
-    s: Descent, u: np.ndarray, y: float, g: np.ndarray, iterations: int
+    s: Descent,
+    u: np.ndarray,
+    y: float,
+    g: np.ndarray,
+    iterations: int,
+    *,
+    gap: float = GAP,
+    near: float = 0.3,
 ) -> tuple[np.ndarray, float, np.ndarray]:
     """Differences once, Broyden's update after every step; one simulation each."""
     longest = LONGEST
     for _ in range(iterations):
         move = s.target(u, y, g) - u
         length = float(np.linalg.norm(move))
-        if (abs(y - s.threshold) <= GAP * s.scale() and length < 0.3) or length < 1e-3:
+        if (abs(y - s.threshold) <= gap * s.scale() and length < near) or length < 1e-3:
             break
         move *= min(1.0, longest / max(length, 1e-300))
         y_new = s.value(u + move)

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Key
 from failure.estimates import GOOD, Estimate, check_threshold, mean_of_terms
 from failure.hlrf import DesignPoint
 from failure.line_roots import curvature, line_roots
+from failure.opposite import OPPOSITE, opposite_side_fails
 from failure.performances import Counted, Performance, Slopes
 
 BEND = 0.8
@@ -57,7 +58,8 @@ def line_sampling(
 
     The verdict is not "good", and the interval withheld or widened, when the design point failed
     its checks, when the interval did not get narrow, when few lines carry the sum, when outputs
-    are invalid, and when lines run backwards (their output falls along `a`).
+    are invalid, when lines run backwards (their output falls along `a`), and when the side opposite
+    to the design point fails too, which costs one value.
 
     Args:
         performance: `x [n, D] -> y [n]`, larger is worse.
@@ -79,10 +81,16 @@ def line_sampling(
 
     Source: Koutsourelakis, Pradlwarter and Schueller (2004).
     """
-    return sample_lines(
+    found = sample_lines(
         performance, threshold, design, key=key, slopes=slopes, factor=factor,
         min_lines=min_lines, max_lines=max_lines,
     ).estimate  # fmt: skip
+    if not math.isfinite(found.probability):
+        return found
+    if opposite_side_fails(performance, threshold, design.axis, design.beta):
+        reasons = [] if found.known else [found.verdict]
+        found = found._replace(upper=1.0, verdict="; ".join([*reasons, OPPOSITE]))
+    return found._replace(n_simulations=found.n_simulations + 1)
 
 
 def sample_lines(

@@ -26,8 +26,12 @@ from failure.estimates import (
 from failure.form import design_points, merge_points
 from failure.hlrf import DesignPoint, find_design_point
 from failure.lines import line_sampling
+from failure.opposite import fails
 from failure.performances import Performance
 from failure.subset import subset_simulation
+
+ALIKE = 0.9
+"""Points with a larger cosine stand for one region."""
 
 __all__ = [
     "DesignPoint",
@@ -111,7 +115,9 @@ def importance_sampling(
         \hat p = \frac1n \sum_i \frac{\phi(u_i)}{q(u_i)} 1[y(u_i) > T]
 
     The nominal part bounds every weight by :math:`1 / \alpha`. Regions that no point stands for
-    are missed: the interval is that of the regions given. With fewer than 10 effective samples
+    are missed: the interval is that of the regions given. One more simulation for each point looks
+    at the opposite side; where it fails and no point stands there, the verdict says so and the
+    upper end is what the nominal draws alone say. With fewer than 10 effective samples
     the interval is withheld: its lower end is 0, its upper end what the nominal draws alone say.
 
     Args:
@@ -158,13 +164,13 @@ def importance_sampling(
         log_ratio = u @ shifts.T - 0.5 * jnp.sum(shifts**2, 1)[None] + log_share[None]
         weight = np.asarray(jnp.exp(-jax.scipy.special.logsumexp(log_ratio, axis=1)))
         y = np.asarray(performance(u))
-    fails = y > threshold
-    term = weight * fails
+    failed = y > threshold
+    term = weight * failed
     invalid = int(np.sum(~np.isfinite(y)))
     mean, lower, upper, effective = mean_of_terms(term)
     # Exact for any regions: the nominal draws, as plain Monte Carlo.
     nominal = np.asarray(pick) == 0
-    certain = clopper_pearson(int(np.sum(fails & nominal)), int(nominal.sum()))[1]
+    certain = clopper_pearson(int(np.sum(failed & nominal)), int(nominal.sum()))[1]
     reasons = []
     if effective < 10.0:
         reasons.append(f"only {effective:.1f} effective samples; raise n or find nearer points")
@@ -172,6 +178,22 @@ def importance_sampling(
     if invalid > 0.05 * n:
         # The share counts only where a failure could be: near the points almost everywhere.
         reasons.append(f"{invalid} of {n} outputs are invalid: they count as no failure")
-        upper = max(upper, float(np.mean(weight * (fails | ~np.isfinite(y)))))
+        upper = max(upper, float(np.mean(weight * (failed | ~np.isfinite(y)))))
+    beside = _mirrored(performance, float(threshold), centres)
+    if beside:
+        reasons.append(
+            f"{beside} of {k} points fail on the opposite side as well, where none of them stands: "
+            "add design points of that side"
+        )
+        upper = max(upper, certain)
     verdict = "; ".join(reasons) or GOOD
-    return Estimate(mean, lower, upper, n, invalid, effective, verdict)
+    return Estimate(mean, lower, upper, n + k, invalid, effective, verdict)
+
+
+def _mirrored(performance: Performance, threshold: float, points: np.ndarray) -> int:
+    """Points whose mirror image, half a sigma farther out, fails and is none of them."""
+    lengths = np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-300)
+    axes = points / lengths
+    failing = fails(performance, threshold, -axes * (lengths + 0.5))
+    known = np.any(axes @ axes.T < -ALIKE, axis=1)
+    return int(np.sum(failing & ~known))

@@ -12,6 +12,7 @@ from jaxtyping import Array, Float, Key
 from failure.estimates import Estimate, add, check_threshold
 from failure.hlrf import DesignPoint, find_design_point, onto_boundary
 from failure.lines import BEND, sample_lines
+from failure.opposite import wide_scale
 from failure.performances import Counted, Performance, Slopes
 
 ALIKE = 0.9
@@ -19,9 +20,6 @@ ALIKE = 0.9
 
 FURTHER = 2.5
 """A region that lies further out than the nearest one by this much does not count [sigma]."""
-
-REACH = 1.7
-"""Wide samples have a standard deviation at which the nearest region is this many away."""
 
 
 class Regions(NamedTuple):
@@ -169,7 +167,7 @@ def probability_by_lines(
     doubts: list[str] = []
     if scan:
         with jax.enable_x64(True):
-            wide = float(np.clip(finder.points[0].beta / REACH, 1.5, 4.0))
+            wide = wide_scale(finder.points[0].beta)
             x = wide * np.asarray(jax.random.normal(keys[-1], (scan, dim)))
         seen = fails = x[np.nan_to_num(counted(x), nan=-np.inf) > threshold]
         tried = 0

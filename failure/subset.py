@@ -17,21 +17,22 @@ from failure.estimates import (
     log_normal_interval,
 )
 from failure.ladder import LEAST_SEEDS, Replicates, ladder_program
+from failure.opposite import wide_scale
 from failure.performances import Performance, traceable
-
-WIDE = 2.5
-"""Standard deviation of the wide samples that look for regions beside the ladder [sigma]."""
 
 
 def _strangers(
     performance: Performance, threshold: float, dim: int, n: int, runs: Replicates, *, key: Array
 ) -> int:
     """Failing wide samples that lie beside all regions of the ladder; 0 for a few stray ones."""
-    x = WIDE * jax.random.normal(key, (n, dim))
+    found = runs.hits >= LEAST_SEEDS
+    if not found.any():
+        return 0
+    scale = wide_scale(float(np.median(runs.depth[found])))
+    x = scale * jax.random.normal(key, (n, dim))
     y = np.asarray(jax.jit(performance)(x))
     fails = np.asarray(x)[y > threshold]
-    found = runs.hits >= LEAST_SEEDS
-    if len(fails) == 0 or not found.any():
+    if len(fails) == 0:
         return 0
     norms = np.linalg.norm(runs.centre[found], axis=1, keepdims=True)
     axes = runs.centre[found] / np.maximum(norms, 1e-30)
@@ -77,7 +78,7 @@ def subset_simulation(
         share: conditional probability of a level.
         replicates: independent runs, at least 3.
         max_levels: ladder's length at most; `share ** max_levels` is the least probability seen.
-        explore: samples of standard deviation 2.5 that look for regions beside the ladder; `n`
+        explore: wide samples (`opposite.wide_scale`) that look for regions beside the ladder; `n`
             without, 0 for none.
 
     Returns:

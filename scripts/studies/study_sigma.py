@@ -8,17 +8,19 @@ probability, which are measured first: long line sampling moves the threshold un
 is the wanted one, and importance sampling from the same point checks it. `--netlists` are circuits
 that only ngspice knows (`examples/`); they have no gradients.
 
-Methods: `lines` (design point, then line sampling), `guided_lines` (values only, direction from a
-Gaussian process), `regions` (all regions that can be found, each by lines), `ak_is` (importance
-sampling on a refined Gaussian process), `importance_sampling` from the design point,
-`subset_simulation`; with `+gradient` where gradients are used, each counted as one simulation
-(`sims_factor2`) or as three (`sims_factor2_price3`). `--searches` look for the first failure in the
-ball of 1.1 design distances. A row of record holds simulations to the first failure, the share of
-runs that end within a factor 2 of the truth with a verdict "good" (`success_rate`; of searches the
-share that finds a failure), what they cost, the share of all intervals that hold the truth
-(`coverage`), and the cosine between the design point that was found and a true one. Every cell is
-kept in `--out`, so the command can be killed and repeated. Writes `results/table_4_sigma.json`;
-with `--pictures FOLDER` errors of all runs against their cost, and design points by transistor.
+Methods: `lines` (design point, then line sampling), `guided_lines` (values only, differences taken
+again where they matter; trusts that there is one mechanism), `guided_lines_scan` (the same with 100
+wide samples that look for others), `regions` (all regions that can be found, each by lines),
+`ak_is` (importance sampling on a refined Gaussian process), `importance_sampling` from the design
+point, `subset_simulation`; with `+gradient` where gradients are used, each counted as one
+simulation (`sims_factor2`) or as three (`sims_factor2_price3`). `--searches` look for the first
+failure in the ball of 1.1 design distances. A row of record holds simulations to the first failure,
+the share of runs that end within a factor 2 of the truth with a verdict "good" (`success_rate`; of
+searches the share that finds a failure), what they cost, the share of all intervals that hold the
+truth (`coverage`), and the cosine between the design point that was found and a true one. Every
+cell is kept in `--out`, so the command can be killed and repeated. Writes
+`results/table_4_sigma.json`; with `--pictures FOLDER` errors of all runs against their cost, and
+design points by transistor.
 """
 
 from __future__ import annotations
@@ -105,10 +107,11 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
         ak = ak_sampling(case.performance, case.threshold, case.dim, key=key, slopes=slopes)
         found, first, gradients = ak.estimate, ak.first_failure, ak.n_gradients
         cosine = nearest(case, ak.point)
-    elif base == "guided_lines":
+    elif base in ("guided_lines", "guided_lines_scan"):
         found, point, first = guided_lines(
-            case.performance, case.threshold, case.dim, key=key, most=max(400, 4 * case.dim)
-        )
+            case.performance, case.threshold, case.dim, key=key, most=max(400, 4 * case.dim),
+            scan=100 if base == "guided_lines_scan" else 0,
+        )  # fmt: skip
         cosine = nearest(case, point)
     elif base == "subset_simulation":
         found = rare_events.subset_simulation(

@@ -116,6 +116,19 @@ def test_all_regions_are_found_and_summed(name):
     np.testing.assert_allclose(found.estimate.probability, problem.probability, rtol=0.02)
 
 
+@pytest.mark.parametrize("name", ["window", "opposite_mechanisms", "shell"])
+def test_lines_say_that_the_opposite_side_fails(name):
+    problem = make_problem(name, 1e-9, DIM)
+    axis = problem.points[0] / np.linalg.norm(problem.points[0])
+    slopes = slopes_by_jax(problem.performance)
+    design = find_design_point(
+        problem.performance, problem.threshold, DIM, slopes=slopes, start=3.0 * axis
+    )
+    found = line_sampling(problem.performance, problem.threshold, design, key=KEY)
+    assert not found.known and "opposite side fails" in found.verdict
+    assert found.lower <= problem.probability <= found.upper == 1.0
+
+
 def test_failures_on_a_whole_circle_are_not_called_known():
     problem = make_problem("shell", 1e-9, DIM)
     for slopes in (None, slopes_by_jax(problem.performance)):

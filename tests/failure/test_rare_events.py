@@ -5,6 +5,7 @@ import pytest
 from scipy import integrate, stats
 
 from failure import rare_events
+from failure.problems import make_problem
 
 DIM = 60
 KEY = jax.random.key(0)
@@ -84,6 +85,22 @@ def test_importance_sampling_misses_a_region_it_is_not_told_of():
         performance, threshold, np.asarray(points[:1]), key=jax.random.key(0)
     )
     assert one.upper < 0.5 * truth
+
+
+def test_importance_sampling_says_that_the_other_side_of_its_points_fails():
+    problem = make_problem("window", 1e-6, DIM)
+
+    def estimate(points):
+        return rare_events.importance_sampling(
+            problem.performance, problem.threshold, points, key=KEY, n=1000
+        )
+
+    one = estimate(problem.points[:1])
+    assert not one.known and "opposite side" in one.verdict
+    assert one.lower <= problem.probability <= one.upper
+    both = estimate(problem.points)
+    assert both.known and both.lower <= problem.probability <= both.upper
+    assert both.n_simulations == 1002
 
 
 def test_monte_carlo_interval_covers_the_truth():
@@ -236,8 +253,6 @@ def test_numpy_simulators_climb_as_well():
 
 
 def test_a_region_beside_the_ladder_is_reported():
-    from failure.problems import make_problem
-
     problem = make_problem("hidden_region", 1e-6, DIM)
     result = rare_events.subset_simulation(
         problem.performance, problem.threshold, DIM, key=KEY, n=500, replicates=3

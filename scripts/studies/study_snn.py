@@ -66,6 +66,11 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         "way, shorter memory of turns": ("way", ("params.goal.memory=0.7",)),
         "way, turns not cut off": ("way", ("params.max_turn=Infinity",)),
         "way, no homeostasis": ("way", ("params.homeostasis=0",)),
+        "way, weights held for 50 ms": ("way", ("config.hold_steps=50",)),
+        "way, weights held for 50 ms, no homeostasis": (
+            "way",
+            ("config.hold_steps=50", "params.homeostasis=0"),
+        ),
         "way, eligibility not centred": ("way", ("params.centring=0",)),
         "way, no reward at collision and arrival": (
             "way",
@@ -103,14 +108,7 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         "way": ("way", ()),
         "way, no homeostasis": ("way", ("params.homeostasis=0",)),
         "way, no homeostasis, not annealed": ("way", ("params.homeostasis=0", "params.anneal=1e9")),
-        "way, no homeostasis, not centred": (
-            "way",
-            ("params.homeostasis=0", "params.centring=0"),
-        ),
-        "way, no homeostasis, twice the rate": (
-            "way",
-            ("params.homeostasis=0", "params.gamma=6e-4"),
-        ),
+        "way, weights held for 50 ms": ("way", ("config.hold_steps=50",)),
         "way, halves tied": ("way", ("config.mirror=true", "params.gamma=6e-4")),
         "way, starts anywhere": ("way", ("config.starts=anywhere",)),
         "way, halves tied, starts anywhere": (

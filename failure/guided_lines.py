@@ -11,10 +11,11 @@ from jaxtyping import Array, Float, Key
 
 from failure.descents import Descent, by_values, cosine_of
 from failure.estimates import GOOD, Estimate, check_threshold
-from failure.lines import interval_of_lines
+from failure.line_roots import bend_of_lines
+from failure.lines import BEND, interval_of_lines
 from failure.opposite import OPPOSITE, opposite_side_fails, wide_strangers
 from failure.performances import Counted, Performance
-from failure.single_lines import roots_by_values
+from failure.single_lines import room_for_bend, roots_by_values
 from failure.tilted_plane import TiltedPlane
 from failure.turned_slopes import SHARE, Slope, again_where_it_matters
 
@@ -128,6 +129,7 @@ class _Found(NamedTuple):
     interval: tuple[float, float, float, float]
     axis: np.ndarray
     beta: float
+    bend: float
 
 
 def _lines(
@@ -146,9 +148,13 @@ def _lines(
         draws = np.asarray(jax.random.normal(key, (most, dim)))
     distances: list[float] = []
     backwards, again, narrow = 0, False, False
-    interval = (math.nan, 0.0, 1.0, 0.0)
+    interval, bend = (math.nan, 0.0, 1.0, 0.0), 0.0
     plane, begun = TiltedPlane(end.point, end.value, end.gradient, end.fresh), counted.n_values
-    axis, beta = end.gradient / np.linalg.norm(end.gradient), float(np.linalg.norm(end.point))
+    axis = end.gradient / np.linalg.norm(end.gradient)
+    beta = float(np.linalg.norm(end.point))
+    middle, _ = roots_by_values(
+        counted, threshold, np.zeros((1, dim)), axis, beta, float(np.linalg.norm(end.gradient))
+    )
     while counted.n_values + 3 * batch <= most and not narrow:
         x, values = counted.samples()
         value, g = plane.corrected(x[begun:], values[begun:])
@@ -162,7 +168,8 @@ def _lines(
         backwards += int(np.sum(slopes < 0.0))
         good = np.array(distances)[np.isfinite(distances)]
         if len(good) >= min_lines:
-            interval = interval_of_lines(good)
+            bend = bend_of_lines(good, float(middle[0]))
+            interval = room_for_bend(interval_of_lines(good), bend)
             mean, lower, upper, _ = interval
             narrow = mean > 0.0 and upper <= factor * mean and lower >= mean / factor
             room = counted.n_values + dim + 4 * batch <= most
@@ -174,7 +181,7 @@ def _lines(
                 u, y, g = by_values(descent, end.point, end.value, fresh, 6)
                 end = Slope(u, y, g, np.ones(dim, bool), turn)
                 plane, begun = TiltedPlane(u, y, g, end.fresh), counted.n_values
-    return _Found(distances, backwards, narrow, interval, axis, beta), end
+    return _Found(distances, backwards, narrow, interval, axis, beta, bend), end
 
 
 def _lines_to_come(interval: tuple[float, float, float, float], lines: int, factor: float) -> float:
@@ -206,6 +213,12 @@ def _judge(
         reasons.append(f"{lines - valid} of {lines} lines have invalid outputs")
     if found.backwards > 0.1 * lines:
         reasons.append(f"{found.backwards} of {lines} lines run backwards")
+    if found.bend > BEND:
+        further.append(
+            f"lines meet the threshold nearer than their middle does, by amounts that differ: the "
+            f"boundary bends towards nominal ({found.bend:.2f} of the sphere's curvature); use "
+            "subset_simulation beside it"
+        )
     if opposite_side_fails(counted, threshold, found.axis, found.beta):
         further.append(OPPOSITE)
     if end.turn < TURNED:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
@@ -33,6 +35,28 @@ def curvature(
     inner = np.linalg.lstsq(v @ q.T, turns @ q.T, rcond=1e-3)[0]
     values, vectors = np.linalg.eigh(0.5 * (inner + inner.T))
     return float(values[-1]), vectors[:, -1] @ q
+
+
+def bend_of_lines(t: Float[np.ndarray, " m"], middle: float) -> float:
+    r"""How far the boundary bends towards nominal, in units of the sphere's curvature.
+
+    Where it bends by :math:`\kappa` in k directions, lines end at :math:`\beta - \tfrac12 \kappa
+    \chi^2_k`, nearer than the middle one by :math:`\tfrac12 \kappa k` with variance
+    :math:`\tfrac12 \kappa^2 k`, so that
+
+    .. math:: \kappa \beta = \beta\, \frac{\mathrm{var}(t)}{\beta - \bar t}
+
+    A slanted boundary spreads the lines but moves their mean nowhere: where it lies within two
+    standard errors of the middle, nothing is known and 0 comes back.
+
+    Args:
+        t: where lines end.
+        middle: where the line through the middle ends, :math:`\beta`.
+    """
+    nearer, spread = middle - float(t.mean()), float(t.std(ddof=1))
+    if not nearer > 2.0 * spread / math.sqrt(len(t)):
+        return 0.0
+    return middle * spread**2 / nearer
 
 
 def line_roots(

@@ -11,7 +11,7 @@ from jaxtyping import Array, Float, Key
 
 from failure.estimates import GOOD, Estimate, check_threshold, mean_of_terms
 from failure.hlrf import DesignPoint
-from failure.line_roots import curvature, line_roots
+from failure.line_roots import bend_of_lines, curvature, line_roots
 from failure.opposite import OPPOSITE, opposite_side_fails
 from failure.performances import Counted, Performance, Slopes
 
@@ -140,7 +140,10 @@ def sample_lines(
     if counted.has_slopes:
         bend, direction = curvature(across[:lines], np.concatenate(slopes_seen), axis, rate)
         bend *= design.beta
-    found = _judge(design, distances[:lines], counted, backwards, narrow, factor, bend)
+    seen = bend
+    if not counted.has_slopes and np.isfinite(distances[:lines]).sum() >= 3:
+        seen = bend_of_lines(distances[:lines][np.isfinite(distances[:lines])], design.beta)
+    found = _judge(design, distances[:lines], counted, backwards, narrow, factor, seen)
     return Lines(found, bend, direction)
 
 

@@ -2,9 +2,12 @@
 
 from __future__ import annotations
 
+import math
+
 import numpy as np
 from jaxtyping import Float
 
+from failure.lines import BEND
 from failure.performances import Counted
 
 NEAR = 1.2
@@ -61,3 +64,14 @@ def roots_by_values(
     return np.where(np.isfinite(y), t + np.clip(step, -LONGEST, 2.0 * LONGEST), np.nan), np.array(
         slopes
     )
+
+
+def room_for_bend(
+    interval: tuple[float, float, float, float], bend: float
+) -> tuple[float, float, float, float]:
+    """The upper end with room for rare lines, missed at first, by the second-order formula.
+
+    Source: Breitung (1984).
+    """
+    mean, lower, upper, effective = interval
+    return mean, lower, min(1.0, upper / math.sqrt(1.0 - min(bend, BEND))), effective

@@ -89,6 +89,24 @@ def test_lines_with_values_only():
     assert found.n_simulations <= 80
 
 
+def test_values_alone_leave_room_where_all_lines_end_nearer_than_their_middle():
+    """Without it 17 of 20 intervals held the truth; a slanted boundary is no bent one."""
+    from failure.line_roots import bend_of_lines
+
+    rng = np.random.default_rng(0)
+    bent = [6.0 - 0.02 * float(rng.chisquare(10)) for _ in range(2000)]
+    assert bend_of_lines(np.array(bent), 6.0) == pytest.approx(0.24, rel=0.2)
+    seen = [bend_of_lines(6.0 + 0.1 * rng.normal(size=10), 6.0) > 0.0 for _ in range(200)]
+    assert np.mean(seen) < 0.1
+    problem = make_problem("bent", 1e-9, DIM)
+    design = find_design_point(problem.performance, problem.threshold, DIM)
+    found = [
+        line_sampling(problem.performance, problem.threshold, design, key=jax.random.key(k))
+        for k in range(20)
+    ]
+    assert sum(e.lower <= problem.probability <= e.upper for e in found) >= 18
+
+
 def test_a_saddle_is_seen_by_its_curvature():
     """From nominal the descent ends between the two nearest points, where all checks hold."""
     problem = make_problem("curved_manifold", 1e-9, DIM)

@@ -181,6 +181,11 @@ def ask(
             "spent; raise n_total for a longer search"
         )
     method = METHODS[config.method]
+    if method.needs_gradient and train is None:
+        raise ValueError(
+            f"train=None: expected level_set_space.level_sets_of_gradient(...) with method "
+            f"{config.method!r}, which learns from the simulator's gradients"
+        )
     with jax.enable_x64(True):
         if method.space == "none":
             state = _baseline(config, state)

@@ -30,12 +30,17 @@ class Method:
     @property
     def reduced(self) -> bool:
         """Whether the search space has fewer dimensions than the task."""
-        return self.space in ("random", "zeros", "bnn", "active")
+        return self.space in ("random", "zeros", "bnn", "active", "level")
 
     @property
     def learned(self) -> bool:
         """Whether the search space is made from evaluations."""
-        return self.space in ("zeros", "bnn", "active")
+        return self.space in ("zeros", "bnn", "active", "level")
+
+    @property
+    def needs_gradient(self) -> bool:
+        """Whether the search space cannot be made from values alone."""
+        return self.space == "level"
 
 
 METHODS: dict[str, Method] = {
@@ -50,8 +55,12 @@ METHODS: dict[str, Method] = {
     "rev_argate_zeros": Method("zeros", label="Rev-ARGate zeros"),
     "rev_argate_bnn": Method("bnn", label="Rev-ARGate BNN"),
     "active_subspace": Method("active", label="active subspace"),
+    "level_sets": Method("level", label="level sets"),
 }
 """Name -> method; what `SearchConfig.method` takes."""
+
+BY_VALUES = tuple(name for name, method in METHODS.items() if not method.needs_gradient)
+"""Methods for any simulator."""
 
 
 @dataclass(frozen=True)
@@ -172,12 +181,13 @@ class SearchConfig:
         dim, most = self.embedding_dim, self.task.dim
         if dim is None:
             # 22 of 60 in the source; of gradients four directions carry nearly all.
-            dim = min(4, most) if method.space == "active" else max(1, round(0.37 * most))
+            own = {"active": min(4, most), "level": min(2, most)}
+            dim = own.get(method.space, max(1, round(0.37 * most)))
             self._set("embedding_dim", dim)
         if not 1 <= dim <= most:
             raise ValueError(f"embedding_dim={dim}: expected 1 ... {most}")
         if method.learned and self.retrain_every is None:
-            self._set("retrain_every", 10 if method.space == "active" else 50)
+            self._set("retrain_every", {"active": 10, "level": 3}.get(method.space, 50))
         elif method.learned and self.retrain_every is not None and self.retrain_every < 0:
             raise ValueError(
                 f"retrain_every={self.retrain_every}: expected at least 0 (0: train once)"

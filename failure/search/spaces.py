@@ -21,6 +21,7 @@ from jaxtyping import Array, Float, Key
 
 from failure import bnn, revnet
 from failure.models.domains import Domain, ball, box, project, sample
+from failure.search.level_set_features import LevelSetFeatures
 from failure.search.task import Task, unit_scale
 
 
@@ -185,6 +186,7 @@ SPACES: dict[str, tuple[Any, dict[str, Any]]] = {
         {"network": revnet.RevNetParams, "restoration": bnn.BNNParams},
     ),
     "ActiveSubspace": (ActiveSubspace, {}),
+    "LevelSetFeatures": (LevelSetFeatures, {"network": revnet.RevNetParams}),
 }
 """Name -> (class, classes of its fields that are trees themselves), for reading a saved space."""
 

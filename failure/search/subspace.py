@@ -106,6 +106,40 @@ def train_subspace(config: SearchConfig, keys: Any, x: np.ndarray, y: np.ndarray
     return _stack(config, [rows[:n] for rows, n in zip(slopes, counts, strict=True)])
 
 
+class Remembered:
+    """A gradient that is evaluated once at every point.
+
+    Args:
+        gradient: `x [n, D] -> dy/dx [n, D]`.
+    """
+
+    def __init__(self, gradient: Gradient) -> None:
+        self._gradient = gradient
+        self._known: dict[bytes, np.ndarray] = {}
+
+    def learn(self, x: Float[np.ndarray, "S n D"]) -> None:
+        """Evaluate what is new, all of it in one call.
+
+        Raises:
+            ValueError: not a row per point.
+        """
+        rows = {row.tobytes(): row for block in x for row in block}
+        new = [row for name, row in rows.items() if name not in self._known]
+        if not new:
+            return
+        slopes = np.asarray(self._gradient(np.stack(new)), np.float64)
+        if slopes.shape != (len(new), x.shape[2]):
+            raise ValueError(
+                f"gradient.shape={slopes.shape}: expected {(len(new), x.shape[2])}, a row per point"
+            )
+        names = [row.tobytes() for row in new]
+        self._known.update(zip(names, slopes, strict=True))
+
+    def __call__(self, x: Float[np.ndarray, "n D"]) -> Float[np.ndarray, "n D"]:
+        """Gradients of points that have been learned."""
+        return np.stack([self._known[row.tobytes()] for row in x])
+
+
 def subspace_of_gradient(gradient: Gradient) -> Any:
     """A `train` of `run` or `ask` that takes the simulator's own gradients.
 
@@ -118,19 +152,10 @@ def subspace_of_gradient(gradient: Gradient) -> Any:
     Returns:
         `train(config, keys, x, y) -> ActiveSubspace`.
     """
-    known: dict[bytes, np.ndarray] = {}
+    known = Remembered(gradient)
 
     def train(config: SearchConfig, keys: Any, x: np.ndarray, y: np.ndarray) -> ActiveSubspace:
-        rows = {row.tobytes(): row for block in x for row in block}
-        new = [row for name, row in rows.items() if name not in known]
-        if new:
-            slopes = np.asarray(gradient(np.stack(new)), np.float64)
-            if slopes.shape != (len(new), x.shape[2]):
-                raise ValueError(
-                    f"gradient.shape={slopes.shape}: expected {(len(new), x.shape[2])}, a row "
-                    "per point"
-                )
-            known.update((row.tobytes(), slope) for row, slope in zip(new, slopes, strict=True))
-        return _stack(config, [np.stack([known[row.tobytes()] for row in block]) for block in x])
+        known.learn(x)
+        return _stack(config, [known(block) for block in x])
 
     return train

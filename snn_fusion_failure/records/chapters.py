@@ -217,7 +217,7 @@ def _simulated(plan: Plan, out: Path, seeds: int) -> Done:
 
 def failures(plan: Plan, tables: Sequence[str]) -> Done:
     """Tables 4.1 and 4.2: searches for failures of a circuit."""
-    from failure.search.methods import METHODS
+    from failure.search.methods import BY_VALUES
     from snn_fusion_failure.records import failure_tables
 
     quick = plan.preset == "quick"
@@ -230,7 +230,7 @@ def failures(plan: Plan, tables: Sequence[str]) -> Done:
             held = out / f"rows_{circuit}.json"
             rows = json.loads(held.read_text(encoding="utf-8")) if held.exists() else []
         else:
-            names = QUICK_METHODS if quick else tuple(METHODS)
+            names = QUICK_METHODS if quick else BY_VALUES
             methods = tuple(filter(plan.wants, names))
             if not methods:  # which the study would read as all of them
                 continue

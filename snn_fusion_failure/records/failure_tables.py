@@ -233,13 +233,14 @@ def main(config: Config) -> dict[str, Any]:
 
     from failure import circuits, plots
     from failure.search.bayesopt import METHODS
+    from failure.search.methods import BY_VALUES
     from failure.search.sharing import side_by_side
     from failure.search.task import Task
 
     circuit = circuits.get(config.circuit)
     table, title = TABLES.get(config.circuit, (config.circuit, config.circuit))
     names = config.specs or circuit.spec_names
-    methods = config.methods or tuple(METHODS)
+    methods = config.methods or BY_VALUES
     columns = [circuit.spec_index(name) for name in names]
     if config.record:
         check_recordable()

@@ -29,6 +29,7 @@ SEARCHES: dict[str, Setting] = {
     "active_subspace": Setting("active_subspace", 10),
     "active_subspace_50": Setting("active_subspace", 50),
     "active_subspace+gradient": Setting("active_subspace", 10, gradient=True),
+    "level_sets+gradient": Setting("level_sets", 10, gradient=True),
     "hdbo": Setting("hdbo", 10),
     "ridge_corner": Setting("ridge_corner", 10),
     "ridge_corner_50": Setting("ridge_corner", 50),
@@ -78,6 +79,7 @@ def search_runs(
 
     from failure.search import bayesopt
     from failure.search.history import first_hit
+    from failure.search.level_set_space import level_sets_of_gradient
     from failure.search.methods import SearchConfig
     from failure.search.subspace import subspace_of_gradient
     from failure.search.task import Task
@@ -94,7 +96,10 @@ def search_runs(
     )  # fmt: skip
     train = None
     if setting.gradient and slopes is not None:
-        train = subspace_of_gradient(lambda x: np.nan_to_num(np.asarray(slopes(x)[1])))
+        learner = subspace_of_gradient
+        if setting.method == "level_sets":
+            learner = level_sets_of_gradient
+        train = learner(lambda x: np.nan_to_num(np.asarray(slopes(x)[1])))
     state = bayesopt.init(config)
     with jax.enable_x64(True):
         while state.n < most and np.isnan(first_hit(state.y, threshold)).any():

@@ -19,6 +19,7 @@ from jaxsnn.critic import credited, features, shaped_reward, temporal_difference
 from jaxsnn.encoding import poisson_spikes
 from jaxsnn.network import Eligibility, NetworkState
 from jaxsnn.network_input import group_input, input_rates
+from jaxsnn.reinforcement import no_eligibility
 from jaxsnn.rewards import motor_rewards, scale_by_remaining_turn, terminal_reward
 from jaxsnn.turn_goal import turn_reward, update_recent_turn, way_reward
 from jaxsnn.window import STDPKernel
@@ -62,7 +63,7 @@ class SNNParams(NamedTuple):
 class SNNMemory(NamedTuple):
     """Eligibility of the last window, the reading acted on, the turns before, and this turn."""
 
-    eligibility: Eligibility | None
+    eligibility: Eligibility
     reading: Reading
     recent_turn: Array
     turn: Array
@@ -98,8 +99,18 @@ def steering_angle(params: NetworkParams, rates: Float[Array, "2"]) -> Float[Arr
     return params.steering_gain * (right - left)
 
 
+def _where(flag: bool | Array, yes: Callable[[], Any], no: Callable[[], Any]) -> Any:
+    """One of two results; where the flag is only known when the program runs, both are in it."""
+    if isinstance(flag, bool):
+        return yes() if flag else no()
+    return jax.lax.cond(flag, yes, no)
+
+
 def snn_agent(
-    config: NetworkConfig, *, plastic: bool = True, reward: RewardFunction | None = None
+    config: NetworkConfig,
+    *,
+    plastic: bool | Bool[Array, ""] = True,
+    reward: RewardFunction | None = None,
 ) -> Agent:
     """The network as an agent.
 
@@ -110,7 +121,8 @@ def snn_agent(
 
     Args:
         config: NetworkConfig.
-        plastic: False for frozen weights: nothing is learnt, and traces are not computed.
+        plastic: False for frozen weights: nothing is learnt, and traces are not computed. A traced
+            scalar for one program that does either.
         reward: a function of one's own in place of the rewards on the way,
             `(params, reading, recent_turn, turn) -> [left, right]`: NetworkParams, what the network
             saw, the leaky mean of the turns before [deg], and the turn that the motors ask for
@@ -121,7 +133,8 @@ def snn_agent(
     """
     n_windows = config.control_steps // config.hold_steps
     table = config.rates
-    foresees = plastic and (config.critic == "td" or config.shaping != "none")
+    learns = plastic is not False
+    foresees = learns and (config.critic == "td" or config.shaping != "none")
 
     def reward_of(
         constants: NetworkParams, reading: Reading, window: Eligibility, recent_turn: Array
@@ -193,12 +206,20 @@ def snn_agent(
             window_key = jax.random.fold_in(key, index)
             return poisson_spikes(rates, config.hold_steps, dt=config.dt, key=window_key)
 
-        def run(state: NetworkState, index: Array | int, keep: Any) -> tuple:
+        def run(
+            state: NetworkState, index: Array | int, keep: Any, before: Eligibility
+        ) -> tuple[NetworkState, Eligibility, network.Spikes]:
             pre = draw(index)
-            if not plastic:
-                state, spikes = network.fire(config, constants, state, pre)
-                return state, None, spikes
-            return network.window(config, constants, params.kernel, state, pre, keep)
+            state, spikes = network.fire(config, constants, state, pre)
+
+            def remember() -> tuple[NetworkState, Eligibility]:
+                new, eligibility = network.remember(
+                    config, constants, params.kernel, state, pre, spikes, keep
+                )
+                return new, eligibility._replace(duration=duration)
+
+            state, eligibility = _where(plastic, remember, lambda: (state, before))
+            return state, eligibility, spikes
 
         def count(spikes: network.Spikes) -> Array:
             hidden = jnp.sum(spikes.hidden) / config.n_hidden
@@ -208,28 +229,38 @@ def snn_agent(
         keep = 1.0 - fresh.astype(dtype)
         learning = active.astype(dtype) * learning_share(constants, state)
         total = jnp.zeros((3,), dtype)
-        if n_windows > 1:
-
+        duration = jnp.asarray(config.hold_steps * config.dt, dtype)
+        eligibility = no_eligibility(state.weights, duration)
+        if n_windows == 1:
+            state, eligibility, spikes = run(state, 0, keep, eligibility)
+            total = total + count(spikes)
+        else:
+            # One piece of program for all windows: the eligibility goes round the loop, since the
+            # last window's reward has to wait for what comes of the move.
             def body(carry: tuple, index: Array) -> tuple:
-                state, total = carry
+                state, before, total = carry
                 window_keep = jnp.where(index == 0, keep, 1.0)
-                state, eligibility, spikes = run(state, index, window_keep)
-                if plastic:
-                    weights = network.reinforce(
-                        config, constants, state.weights, eligibility,
-                        reward_of(constants, reading, eligibility, recent_turn), learning,
+                state, eligibility, spikes = run(state, index, window_keep, before)
+                if learns:
+                    weights = jax.lax.cond(
+                        (index < n_windows - 1) & plastic,
+                        lambda: network.reinforce(
+                            config, constants, state.weights, eligibility,
+                            reward_of(constants, reading, eligibility, recent_turn), learning,
+                        ),
+                        lambda: state.weights,
                     )  # fmt: skip
                     state = state._replace(weights=weights)
-                return (state, total + count(spikes)), None
+                return (state, eligibility, total + count(spikes)), None
 
-            (state, total), _ = jax.lax.scan(body, (state, total), jnp.arange(n_windows - 1))
-            keep = jnp.ones_like(keep)
-        state, eligibility, spikes = run(state, n_windows - 1, keep)
+            (state, eligibility, total), _ = jax.lax.scan(
+                body, (state, eligibility, total), jnp.arange(n_windows)
+            )
         # A robot that waits for the others of its block learns nothing, running means included.
         mine = state.baseline_input, state.baseline_hidden
         mine = jax.tree.map(lambda new, old: jnp.where(active, new, old), mine, baselines)
         state = state._replace(baseline_input=mine[0], baseline_hidden=mine[1])
-        firing = (total + count(spikes)) / (config.control_steps * config.dt)
+        firing = total / (config.control_steps * config.dt)
         limit = constants.max_turn
         steering = jnp.clip(steering_angle(constants, firing[:2]), -limit, limit)
         turned = update_recent_turn(constants.goal, recent_turn, steering)
@@ -244,9 +275,17 @@ def snn_agent(
         next_reading: Reading | None,
         active: Bool[Array, ""],
     ) -> NetworkState:
-        if not plastic or memory.eligibility is None:
-            return state
-        constants = params.network
+        given = params.network, state, memory, outcome, next_reading, active
+        return _where(plastic, lambda: rewarded(*given), lambda: state)
+
+    def rewarded(
+        constants: NetworkParams,
+        state: NetworkState,
+        memory: SNNMemory,
+        outcome: Outcome,
+        next_reading: Reading | None,
+        active: Bool[Array, ""],
+    ) -> NetworkState:
         observed = memory.reading
         if config.reward_timing == "after" and next_reading is not None:
             observed = next_reading
@@ -276,6 +315,6 @@ def snn_agent(
         act=act,
         learn=learn,
         finite=finite,
-        needs_next=foresees or (plastic and config.reward_timing == "after"),
+        needs_next=foresees or (learns and config.reward_timing == "after"),
         info=("left motor [Hz]", "right motor [Hz]", "hidden [Hz]"),
     )

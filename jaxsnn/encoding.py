@@ -199,7 +199,9 @@ def poisson_spikes(
     require_whole("n_steps", n_steps, 1, "ask for at least one step")
     check_rates(rates, dt=dt)
     n = rates.shape[0]
-    words = jax.random.bits(key, (n_steps, (n + 1) // 2), jnp.uint32)
+    half = (n + 1) // 2
+    # The same words as drawn in two dimensions, which take twice as long to compile.
+    words = jax.random.bits(key, (n_steps * half,), jnp.uint32).reshape(n_steps, half)
     low, high = words & jnp.uint32(0xFFFF), words >> jnp.uint32(16)
     draws = jnp.concatenate([low, high], axis=1)[:, :n]
     threshold = jnp.round(rates * (dt * 65536.0)).astype(jnp.uint32)

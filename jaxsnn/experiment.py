@@ -19,6 +19,7 @@ from jaxsnn._checks import require, require_keys, require_whole
 from jaxsnn.agents import Agent, RewardFunction, snn_agent, snn_params
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights
 from jaxsnn.network import NetworkState
+from jaxsnn.phases import run_phases
 from jaxsnn.trials import TrialResult, check_circles, run_phase, start_states
 
 TEST_TRIALS = {1: 30, 2: 20, 3: 20}
@@ -116,6 +117,8 @@ def run_experiment(
         weights is None or states is None,
         "weights, states: expected one of them; the states hold weights",
     )
+    # Agents of one's own, or a second map, need not be of the form of the first.
+    one_loop = agents is None and test_map is None
     if agents is None:
         if config is None:
             raise ValueError("config=None: expected a NetworkConfig; or give agents of your own")
@@ -134,6 +137,15 @@ def run_experiment(
         if weights is not None:
             states = states._replace(weights=weights)
         axes = {"params_axis": params_axis, "map_axis": map_axis, "max_steps": max_steps}
+        if one_loop:
+            counts = (n_learn, n_test, n_online) if n_online else (n_learn, n_test)
+            states, phases = run_phases(
+                lambda learns: snn_agent(config, reward=reward, plastic=learns),
+                params, map, states, keys=split[:, 1 : 1 + len(counts)], n_trials=counts,
+                plastic=(True, False, True)[: len(counts)], circles=circles, record=record, **axes,
+            )  # fmt: skip
+            online = phases[2] if n_online else None
+            return Experiment(phases[0], phases[1], online, states if keep_states else None)
         states, learning = run_phase(
             learner, params, map, states, keys=split[:, 1],
             n_trials=n_learn, circles=circles, record=record, **axes,

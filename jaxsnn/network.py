@@ -41,6 +41,7 @@ __all__ = [
     "network_config",
     "network_params",
     "reinforce",
+    "remember",
     "reset_membranes",
     "step",
     "window",
@@ -190,6 +191,23 @@ def window(
         all spikes.
     """
     state, spikes = fire(config, params, state, pre)
+    return *remember(config, params, stdp, state, pre, spikes, keep), spikes
+
+
+def remember(
+    config: NetworkConfig,
+    params: NetworkParams,
+    stdp: STDPKernel,
+    state: NetworkState,
+    pre: Float[Array, "t n_in"],
+    spikes: Spikes,
+    keep: float | Float[Array, ""] = 1.0,
+) -> tuple[NetworkState, Eligibility]:
+    """What the spikes of a window, of the inputs and from `fire`, leave in the synapses.
+
+    Returns:
+        The state with new traces and running means, and the eligibility of the window.
+    """
     inputs, hidden = _centred(params, state, pre, spikes.hidden)
     stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, inputs, spikes.hidden, keep)
     stdp_output, second = jax.vmap(stdp_window, in_axes=(None, 0, 1, 1, None))(
@@ -215,4 +233,4 @@ def window(
         output_count=jnp.sum(spikes.output, axis=0),
         duration=duration,
     )
-    return state, eligibility, spikes
+    return state, eligibility

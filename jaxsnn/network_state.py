@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import NamedTuple
 
 import jax
@@ -69,7 +70,7 @@ def init(
         keys = jax.random.split(key)
         drawn = []
         for k, shape, bound in zip(keys, shapes, top, strict=True):
-            u = jax.random.uniform(k, shape)
+            u = jax.random.uniform(k, (math.prod(shape),)).reshape(shape)
             drawn.append((params.init_low + (1.0 - params.init_low) * u) * bound)
         weights = tied(config, Weights(*drawn)) if config.mirror else Weights(*drawn)
     else:

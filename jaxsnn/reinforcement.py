@@ -30,6 +30,12 @@ class Eligibility(NamedTuple):
     duration: float | Array
 
 
+def no_eligibility(weights: Weights, duration: float | Array) -> Eligibility:
+    """That of a window without a spike, for these weights."""
+    hidden, output = (jnp.zeros_like(w) for w in weights)
+    return Eligibility(hidden, output, hidden[0], output[:, 0], duration)
+
+
 def reinforce(
     config: NetworkConfig,
     params: NetworkParams,
@@ -75,11 +81,9 @@ def reinforce(
     short_output = (eta * params.homeostasis_output) * (
         eligibility.duration - eligibility.output_count / params.rate_output
     )
+    either = jnp.exp(jnp.stack([short_hidden, -short_hidden]))
     scaled = Weights(
-        hidden=weights.hidden
-        * jnp.where(
-            sign_pre[:, None] > 0, jnp.exp(short_hidden)[None], jnp.exp(-short_hidden)[None]
-        ),
+        hidden=weights.hidden * jnp.where(sign_pre[:, None] > 0, either[0], either[1]),
         output=weights.output * jnp.exp(short_output[:, None] * sign_hidden.reshape(2, -1)),
     )
     bounds = weight_bounds(config, params)

@@ -8,6 +8,7 @@ takes all robots.
 
 from __future__ import annotations
 
+import functools
 from typing import Any, NamedTuple
 
 import jax
@@ -68,13 +69,11 @@ def success_rate(result: TrialResult) -> Float[Array, "*robots"]:
 
 def _advance(
     agent: Agent,
-    n_trials: int,
+    n_trials: int | Array,
     max_steps: int,
-    circles: Array | None,
-    first: int,
     params: Any,
     map: world.WorldParams,
-    key: Key[Array, ""],
+    starts: _Start,
     carry: _Carry,
 ) -> _Carry:
     """One control step of one robot, and the start of its next trial when this one is over."""
@@ -82,7 +81,7 @@ def _advance(
     active = carry.trial < n_trials
     robot, result = carry.robot, carry.result
     step = result.steps[trial]
-    step_key = jax.random.fold_in(jax.random.fold_in(key, 2 * _number(trial, first) + 1), step)
+    step_key = jax.random.fold_in(starts.key[trial], step)
     reading = world.observe(map, robot)
     state, steering, memory, info = agent.act(
         params, carry.agent, reading, step == 0, active, key=step_key
@@ -99,25 +98,29 @@ def _advance(
     status = jnp.where(outcome.arrived, jnp.int32(Status.ARRIVED), status)
     status = jnp.where(broken, jnp.int32(Status.NON_FINITE), status)
 
-    # A robot that has done all its trials writes out of bounds, that is, nowhere.
-    at = jnp.where(active, trial, n_trials)
-    driven = jnp.hypot(moved.x - robot.x, moved.y - robot.y)
-    poses = result.poses
-    if poses is not None:
-        poses = poses.at[at, step + 1].set(_pose(moved), mode="drop")
     following_trial = jnp.where(broken, n_trials, trial + over.astype(jnp.int32))
     following_trial = jnp.where(active, following_trial, carry.trial)
     begins = over & active & (following_trial < n_trials)
-    begin = _start(key, following_trial, map, circles, n_trials, first)
+    at = jnp.minimum(following_trial, n_trials - 1)
+    begin = jax.tree.map(lambda x: x[at], starts.robot)
     robot = jax.tree.map(lambda a, b: jnp.where(begins, a, b), begin, moved)
+    driven = jnp.hypot(moved.x - carry.robot.x, moved.y - carry.robot.y)
+    # The row of this trial, by a mask: indices are slower, to compile and to run. A robot that has
+    # done all its trials has none.
+    row = (jnp.arange(result.status.shape[0]) == trial) & active
+    seen = info[None].astype(result.info.dtype)
+    poses = result.poses
     if poses is not None:
-        row = jnp.where(begins, following_trial, n_trials)
-        poses = poses.at[row, 0].set(_pose(begin), mode="drop")
+        outside = poses.shape[0]
+        at = jnp.where(active, trial, outside)
+        poses = poses.at[at, step + 1].set(_pose(moved), mode="drop")
+        at = jnp.where(begins, following_trial, outside)
+        poses = poses.at[at, 0].set(_pose(begin), mode="drop")
     result = TrialResult(
-        status=result.status.at[at].set(status, mode="drop"),
-        steps=result.steps.at[at].add(1, mode="drop"),
-        path=result.path.at[at].add(driven, mode="drop"),
-        info=result.info.at[at].add(info.astype(result.info.dtype), mode="drop"),
+        status=jnp.where(row, status, result.status),
+        steps=jnp.where(row, result.steps + 1, result.steps),
+        path=jnp.where(row, result.path + driven, result.path),
+        info=jnp.where(row[:, None], result.info + seen, result.info),
         poses=poses,
     )
     return _Carry(agent=state, robot=robot, trial=following_trial, result=result)
@@ -127,21 +130,26 @@ def _pose(robot: world.WorldState) -> Array:
     return jnp.stack([robot.x, robot.y, robot.heading])
 
 
-def _number(trial: Array, first: int) -> Array:
-    """Number of a trial in its robot's life, when `first` is that of the phase's first one."""
-    return trial + first if first else trial
+class _Start(NamedTuple):
+    """Where a trial begins, and the key of its steps."""
+
+    robot: world.WorldState
+    key: Array
 
 
-def _start(
-    key: Array,
-    trial: Array,
-    map: world.WorldParams,
-    circles: Array | None,
-    n_trials: int,
-    first: int = 0,
-) -> world.WorldState:
-    circle = None if circles is None else circles[jnp.minimum(trial, n_trials - 1)]
-    return world.reset(map, key=jax.random.fold_in(key, 2 * _number(trial, first)), circle=circle)
+def _starts(
+    map: world.WorldParams, circles: Array | None, key: Array, n_trials: int, first: int
+) -> _Start:
+    """Of all trials of a robot, leaves `[trials]`."""
+
+    def start(given: tuple[Array, Array | None]) -> _Start:
+        trial, circle = given
+        number = 2 * (trial + first if first else trial) + jnp.arange(2)
+        keys = jax.vmap(lambda i: jax.random.fold_in(key, i))(number)
+        return _Start(world.reset(map, key=keys[0], circle=circle), keys[1])
+
+    # One after the other: a draw of many shapes takes longer to compile than all take to run.
+    return jax.lax.map(start, (jnp.arange(n_trials), circles))
 
 
 def start_states(
@@ -156,7 +164,7 @@ def start_states(
     Returns:
         world.WorldState with leaves `[trials]`.
     """
-    return jax.vmap(lambda i: _start(key, i, map, circles, n_trials))(jnp.arange(n_trials))
+    return _starts(map, circles, key, n_trials, 0).robot
 
 
 def check_circles(map: world.WorldParams, circles: Array | None, n_trials: int) -> None:
@@ -194,6 +202,7 @@ def run_phase(
     max_steps: int,
     circles: Int[Array, " trials"] | None = None,
     first: int = 0,
+    run: int | Int[Array, ""] | None = None,
     params_axis: Any = None,
     map_axis: Any = None,
     record: bool = False,
@@ -211,7 +220,9 @@ def run_phase(
         keys: one per robot.
         n_trials: trials per robot.
         max_steps: control steps after which a trial is given up.
-        circles: start circle of each trial; drawn at random when not given.
+        circles: start circle of each trial; drawn at random when not given or negative.
+        run: do only so many of the trials, at most `n_trials` (may be traced); the others are
+            left NOT_RUN.
         first: number of the first trial: a phase in two parts, the second one from the states and
             the number at which the first one ended, is the phase in one.
         params_axis, map_axis: 0 when each robot has its own, a tree for some leaves only, as in
@@ -233,13 +244,14 @@ def run_phase(
     robots = keys.shape[0]
     n_info = len(agent.info)
 
-    def begin(key: Array, map: world.WorldParams) -> tuple[world.WorldState, TrialResult]:
-        robot = _start(key, jnp.zeros((), jnp.int32), map, circles, n_trials, first)
+    def begin(key: Array, map: world.WorldParams) -> tuple[_Start, TrialResult]:
+        starts = _starts(map, circles, key, n_trials, first)
+        robot = jax.tree.map(lambda x: x[0], starts.robot)
         poses = None
         if record:
             poses = jnp.full((n_trials, max_steps + 1, 3), jnp.nan, robot.x.dtype)
             poses = poses.at[0, 0].set(_pose(robot))
-        return robot, TrialResult(
+        return starts, TrialResult(
             status=jnp.full((n_trials,), Status.NOT_RUN, jnp.int32),
             steps=jnp.zeros((n_trials,), jnp.int32),
             path=jnp.zeros((n_trials,), robot.x.dtype),
@@ -247,14 +259,14 @@ def run_phase(
             poses=poses,
         )
 
-    def advance(params: Any, map: world.WorldParams, key: Array, carry: _Carry) -> _Carry:
-        return _advance(agent, n_trials, max_steps, circles, first, params, map, key, carry)
-
+    last = n_trials if run is None else run
+    advance = functools.partial(_advance, agent, last, max_steps)
     many = jax.vmap(advance, in_axes=(params_axis, map_axis, 0, 0))
-    robot, result = jax.vmap(begin, in_axes=(0, map_axis))(keys, map)
+    starts, result = jax.vmap(begin, in_axes=(0, map_axis))(keys, map)
+    robot = jax.tree.map(lambda x: x[:, 0], starts.robot)
     carry = _Carry(states, robot, jnp.zeros((robots,), jnp.int32), result)
     carry = jax.lax.while_loop(
-        lambda c: jnp.any(c.trial < n_trials), lambda c: many(params, map, keys, c), carry
+        lambda c: jnp.any(c.trial < last), lambda c: many(params, map, starts, c), carry
     )
     result = carry.result
     steps = jnp.maximum(result.steps, 1).astype(result.info.dtype)

@@ -65,34 +65,35 @@ def stdp_kernel(params: STDPParams, n_steps: int, *, dt: float) -> STDPKernel:
     t = jnp.arange(n_steps)
     lag = t[:, None] - t[None, :]  # post step minus pre step
     dtype = default_float()
-    left = (n_steps - 1 - t).astype(dtype)
-    rate_z, rate_plus, rate_minus = (
-        dt / tau for tau in (params.tau_z, params.tau_plus, params.tau_minus)
-    )
+    left = n_steps - 1 - t
+    rates = [dt / tau for tau in (params.tau_z, params.tau_plus, params.tau_minus)]
+    # What is left after 0 .. T steps of z and of the two traces, one exponential for all.
+    table = jnp.stack([jnp.asarray(rate, dtype) for rate in rates])
+    table = jnp.exp(-table[:, None] * jnp.arange(n_steps + 1).astype(dtype)[None])
+    kept_z, kept_plus, kept_minus = table
+    rate_z = rates[0]
     # expm1 keeps the sums exact where tau_z is long against the step.
-    at_end = jnp.exp(-rate_z * left) / params.tau_z
-    summed = jnp.expm1(-rate_z * (left + 1.0)) / jnp.expm1(-rate_z) * dt / params.tau_z
+    at_end = kept_z[left] / params.tau_z
+    sums = jnp.expm1(-rate_z * (left + 1).astype(dtype)) / jnp.expm1(-rate_z)
+    summed = sums * dt / params.tau_z
     weight = jnp.stack([at_end, summed])
     a_minus = params.a_minus * params.anti_causal
-    distance = jnp.abs(lag).astype(dtype)
-    causal = jnp.where(lag >= 0, params.a_plus * jnp.exp(-rate_plus * distance), 0.0)
-    anti = jnp.where(lag <= 0, a_minus * jnp.exp(-rate_minus * distance), 0.0)
+    distance = jnp.abs(lag)
+    causal = jnp.where(lag >= 0, params.a_plus * kept_plus[distance], 0.0)
+    anti = jnp.where(lag <= 0, a_minus * kept_minus[distance], 0.0)
     inner = weight[:, :, None] * causal[None] + weight[:, None, :] * anti[None]
-    since = (t + 1).astype(dtype)  # steps since the traces at the window's start
-    old_plus = weight * jnp.exp(-rate_plus * since)[None]
-    old_minus = weight * jnp.exp(-rate_minus * since)[None]
+    old_plus = weight * kept_plus[1:][None]
+    old_minus = weight * kept_minus[1:][None]
     top = jnp.concatenate([inner, old_plus[:, :, None]], axis=2)
     corner = jnp.zeros((2, 1, 1), top.dtype)
     bottom = jnp.concatenate([old_minus[:, None, :], corner], axis=2)
-    n = float(n_steps)
-    carry_sum = jnp.expm1(-rate_z * n) / jnp.expm1(-rate_z) * jnp.exp(-rate_z) * dt
     return STDPKernel(
         pairs=jnp.concatenate([top, bottom], axis=1),
-        carry=jnp.stack([jnp.exp(jnp.asarray(-rate_z * n)), carry_sum]),
-        plus=params.a_plus * jnp.exp(-rate_plus * left),
-        minus=a_minus * jnp.exp(-rate_minus * left),
-        carry_plus=jnp.exp(jnp.asarray(-rate_plus * n)),
-        carry_minus=jnp.exp(jnp.asarray(-rate_minus * n)),
+        carry=jnp.stack([kept_z[-1], sums[0] * kept_z[1] * dt]),
+        plus=params.a_plus * kept_plus[left],
+        minus=a_minus * kept_minus[left],
+        carry_plus=kept_plus[-1],
+        carry_minus=kept_minus[-1],
     )
 
 

@@ -24,10 +24,11 @@ from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxsnn import geometry
-from jaxsnn._checks import require_key
+from jaxsnn._checks import concrete, require_key
 from jaxsnn.way import WayLength, remaining_way, turn_onto_way
 
 N_SONARS = 5
@@ -135,32 +136,48 @@ def reset(
     Args:
         params: the map.
         key: typed PRNG key.
-        circle: index of the start circle; drawn with `start_probs` when it is not given.
+        circle: index of the start circle; drawn with `start_probs` when it is not given or, in an
+            array, negative.
 
     Returns:
         WorldState at step 0.
     """
     require_key(key)
-    k_circle, k_radius, k_angle, k_heading, k_noise = jax.random.split(key, 5)
+    keys = jax.random.split(key, 5)
     dtype = params.starts.dtype
-    if circle is None:
-        circle = jax.random.categorical(k_circle, jnp.log(params.start_probs))
+    if not isinstance(circle, int):
+        drawn = _drawn_circle(params, keys[0])
+        circle = drawn if circle is None else jnp.where(circle < 0, drawn, circle)
     start = params.starts[circle]
-    radius = start[2] * jnp.sqrt(jax.random.uniform(k_radius, dtype=dtype))
-    phi = 2.0 * jnp.pi * jax.random.uniform(k_angle, dtype=dtype)
+    # One draw from three keys: a random number takes longer to compile than to draw.
+    u = jax.vmap(lambda k: jax.random.uniform(k, dtype=dtype))(keys[1:4])
+    radius = start[2] * jnp.sqrt(u[0])
+    phi = 2.0 * jnp.pi * u[1]
     x = start[0] + radius * jnp.cos(phi)
     y = start[1] + radius * jnp.sin(phi)
-    spread = params.heading_spread * jax.random.uniform(
-        k_heading, dtype=dtype, minval=-1.0, maxval=1.0
-    )
+    spread = params.heading_spread * (2.0 * u[2] - 1.0)
     towards = jnp.arctan2(params.target[1] - y, params.target[0] - x)
     heading = _wrap(towards + jnp.deg2rad(spread))
-    return WorldState(x, y, heading, jnp.zeros((), jnp.int32), k_noise)
+    return WorldState(x, y, heading, jnp.zeros((), jnp.int32), keys[4])
+
+
+def _drawn_circle(params: WorldParams, key: Key[Array, ""]) -> int | Int[Array, ""]:
+    """A start circle by `start_probs`; where the map is known to have one only, that one."""
+    probs = concrete(params.start_probs)
+    if probs is not None and probs.ndim == 1 and np.count_nonzero(probs) == 1:
+        return int(np.argmax(probs))
+    return jax.random.categorical(key, jnp.log(params.start_probs))
 
 
 def _wrap(heading: Array) -> Array:
     """The same direction in (-pi, pi]."""
     return jnp.arctan2(jnp.sin(heading), jnp.cos(heading))
+
+
+def _silent(params: WorldParams) -> bool:
+    """Whether the sensors are known to have no noise; inside jit it is, for a map given outside."""
+    known = [concrete(x) for x in (params.sonar_noise, params.distance_noise, params.angle_noise)]
+    return all(x is not None and not x.any() for x in known)
 
 
 def observe(params: WorldParams, state: WorldState, *, others: Discs | None = None) -> Reading:
@@ -219,12 +236,15 @@ def observe(params: WorldParams, state: WorldState, *, others: Discs | None = No
     )
     distance = jnp.sqrt(jnp.sum(to_target**2))
 
-    n = ranges.shape[0]
-    noise = jax.random.normal(jax.random.fold_in(state.key, state.t), (n + 2,), dtype=ranges.dtype)
-    ranges = jnp.clip(ranges + params.sonar_noise * noise[:n], 0.0, params.sonar_range)
+    if not _silent(params):
+        n, noise_key = ranges.shape[0], jax.random.fold_in(state.key, state.t)
+        noise = jax.random.normal(noise_key, (n + 2,), dtype=ranges.dtype)
+        ranges = ranges + params.sonar_noise * noise[:n]
+        distance = distance + params.distance_noise * noise[-2]
+        angle = angle + params.angle_noise * noise[-1]
+    ranges = jnp.clip(ranges, 0.0, params.sonar_range)
     ranges = jnp.where(params.sonar_failed, params.sonar_stuck, ranges)
-    distance = jnp.clip(distance + params.distance_noise * noise[-2], 0.0, params.distance_range)
-    angle = angle + params.angle_noise * noise[-1]
+    distance = jnp.clip(distance, 0.0, params.distance_range)
     # Noise may carry the angle over the cut; -180 itself is written as 180.
     angle = jnp.where(angle <= -180.0, angle + 360.0, angle)
     angle = jnp.where(angle > 180.0, angle - 360.0, angle)

@@ -47,7 +47,7 @@ def test_the_space_lies_about_the_best_evaluation_and_keeps_its_other_features()
         moved, _ = one.decode(domain, jnp.array([0.1, -0.05]))
         back = one.encode(moved)
     np.testing.assert_allclose(middle, best, atol=1e-8)
-    assert clipped == 0.0
+    assert float(np.asarray(clipped)) == 0.0
     np.testing.assert_allclose(back, [0.1, -0.05], atol=1e-8)
     # Both active features together hold what changes the output.
     away = np.asarray(moved) - best

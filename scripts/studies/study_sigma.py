@@ -247,7 +247,9 @@ def main(config: Config) -> dict[str, Any]:
                     new = rows_of(case, method, runs)
                     rows += new
                     title = "Failures at fixed probability"
-                    record_table(config.record, "4.sigma", title, new, preset="paper")
+                    record_table(
+                        config.record, "4.sigma", title, new, preset="paper", whole_cells=True
+                    )
                     bar.advance(job)
     if config.pictures is not None:
         draw_errors(cells, config.pictures / "table_4_sigma.png")
@@ -268,7 +270,8 @@ def other_rows(config: Config, case: Case) -> list[dict[str, Any]]:
             ),
         )  # fmt: skip
         rows += rows_of_search(case.row, name, case.truth, case.threshold, runs)
-    record_table(config.record, "4.sigma", "Failures at fixed probability", rows, preset="paper")
+    title = "Failures at fixed probability"
+    record_table(config.record, "4.sigma", title, rows, preset="paper", whole_cells=True)
     return rows
 
 

@@ -107,8 +107,12 @@ def record_table(
     *,
     preset: str,
     compared: Iterable[Compared] = (),
+    whole_cells: bool = False,
 ) -> None:
     """Write or update a table of record; rows are replaced by (row, model, metric), others stay.
+
+    With `whole_cells` rows are replaced by (row, model): a metric that a cell has no longer, such
+    as the cost of successful runs where none succeeds now, goes with its old value.
 
     Every row keeps the command and the commit that made it. What is `compared` is worked out from
     all rows of the table, those of earlier commands too. The interval of a share is one that stays
@@ -133,8 +137,9 @@ def record_table(
     def key(row: dict[str, Any]) -> tuple[Any, ...]:
         return row["row"], row["model"], row["metric"]
 
-    new = {key(row) for row in rows}
-    kept = [row for row in recorded(path) if key(row) not in new]
+    parts = 2 if whole_cells else 3
+    new = {key(row)[:parts] for row in rows}
+    kept = [row for row in recorded(path) if key(row)[:parts] not in new]
     held = {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows}
     comparisons = compare_columns(held["rows"], compared)
     write_json(path, held | ({"comparisons": comparisons} if comparisons else {}))

@@ -13,7 +13,7 @@ import numpy as np
 import pytest
 from scipy import stats
 
-from snn_fusion_failure.records.rows import Compared, record_table, summarize
+from snn_fusion_failure.records.rows import Compared, record_table, recorded, summarize
 from snn_fusion_failure.runs import (
     WorkFailedError,
     append_metrics,
@@ -224,3 +224,19 @@ def test_result_line_and_failure(capsys: pytest.CaptureFixture[str]) -> None:
         fail("n_clean=9")
     assert left.value.code == 2
     assert capsys.readouterr().err == "error: n_clean=9\n"
+
+
+def test_a_metric_that_a_cell_has_no_longer_goes_with_whole_cells(tmp_path: Path) -> None:
+    """What ten successful runs cost stayed in the table after none succeeded any more."""
+    path = tmp_path / "t.json"
+
+    def row(model: str, metric: str, mean: float) -> dict[str, object]:
+        return {"row": "window", "model": model, "metric": metric, "unit": "1", "mean": mean}
+
+    first = [row("a", "success", 0.5), row("a", "cost", 165.0), row("b", "cost", 20.0)]
+    record_table(path, "4", "T", first, preset="paper", whole_cells=True)
+    record_table(path, "4", "T", [row("a", "success", 0.0)], preset="paper", whole_cells=True)
+    held = {(r["model"], r["metric"]): r["mean"] for r in recorded(path)}
+    assert held == {("b", "cost"): 20.0, ("a", "success"): 0.0}
+    record_table(path, "4", "T", [row("b", "success", 1.0)], preset="paper")
+    assert ("b", "cost") in {(r["model"], r["metric"]) for r in recorded(path)}

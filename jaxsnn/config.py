@@ -42,22 +42,20 @@ class NetworkConfig:
         bounds: "hard" (the source) or "soft".
         w_max_split: the half of the first layer's synapses with the lower bound: those onto
             inhibitory neurons ("post") or from inhibitory inputs ("pre"); the source says "half".
-        angle_code: order of the rates of the angle's intervals, see `encoding.ANGLE_CODES`.
+        angle_code: order of the rates of the angle's intervals (`encoding.ANGLE_CODES`).
         reward_timing: the reward of a control step comes from the reading that the network saw
             ("before") or from the one after the move ("after").
         input_code: one input group for each "sensor", whose rate says the interval (the source), or
             one for each "interval" (`encoding.interval_rates`).
-        turn_groups: two more input groups fire in proportion to the robot's recent turns to the
-            left and to the right: what a network without recurrence has of memory.
-        guidance: rewards on the way by the "nearest" obstacle (the source) or "graded" from all
-            sonars (`turn_goal.turn_reward`), or by the turn onto the shortest "way" from a trainer
-            that knows the map (`turn_goal.way_reward`), or "none".
+        turn_groups: two more input groups fire in proportion to the recent turns to either side.
+        guidance: rewards by the "nearest" obstacle (the source), "graded" from all sonars
+            (`turn_goal.turn_reward`), by the shortest "way" (`turn_goal.way_reward`), or "none".
         critic: "td": a step's reward is its temporal-difference error (`jaxsnn.critic`).
-        credit: who gets that error and what the potential gives, see `critic.credited`.
-        shaping: potential of the reward of a step, see `critic.potential`.
+        credit, shaping: who gets that error, and the potential of a step's reward (`critic`).
         mirror: tie the two halves of the network (`jaxsnn.mirror`).
         n_sonars: of the map's robot, an odd number (`make_map(sonar_angles=...)`).
         starts: of learning trials, the map's "circles" or "anywhere" (`ways.training_map`).
+        engine: what computes a window, "xla" or "native" (`jaxsnn.native`).
 
     Raises:
         ValueError, TypeError: what makes no network.
@@ -85,6 +83,7 @@ class NetworkConfig:
     mirror: bool = False
     n_sonars: int = 5
     starts: Literal["circles", "anywhere"] = "circles"
+    engine: Literal["xla", "native"] = "xla"
 
     def __post_init__(self) -> None:
         """Refuse sizes and choices that make no network."""
@@ -123,6 +122,7 @@ class NetworkConfig:
             "shaping": ("none", "straight", "way"),
             "mirror": (False, True),
             "starts": ("circles", "anywhere"),
+            "engine": ("xla", "native"),
         }
         for name, allowed in choices.items():
             require_choice(name, getattr(self, name), allowed)

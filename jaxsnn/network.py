@@ -12,6 +12,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsnn import native
 from jaxsnn.config import (
     NetworkConfig,
     NetworkParams,
@@ -22,7 +23,7 @@ from jaxsnn.config import (
 )
 from jaxsnn.network_state import NetworkState, Spikes, check_weights, init, reset_membranes
 from jaxsnn.neurons import LIFState, lif_step
-from jaxsnn.plasticity import stdp_step
+from jaxsnn.plasticity import STDPState, stdp_step
 from jaxsnn.reinforcement import Eligibility, reinforce
 from jaxsnn.running_mean import Baseline, baseline_update
 from jaxsnn.window import STDPKernel, stdp_kernel, stdp_window
@@ -154,6 +155,14 @@ def fire(
 ) -> tuple[NetworkState, Spikes]:
     """Run the neurons over the rows of `pre` with the weights held and no plasticity."""
     sign_pre, _ = neuron_signs(config)
+    if config.engine == "native":
+        native.check(state.weights.hidden)
+        (hidden, output), *spikes = native.fire(
+            (params.hidden, params.output), (state.hidden, state.output), state.weights.hidden,
+            _signed_output(config, params, state.weights), jnp.asarray(sign_pre),
+            params.gain_input, pre, dt=config.dt,
+        )  # fmt: skip
+        return state._replace(hidden=hidden, output=output), Spikes(*spikes)
     jumps = params.gain_input * ((pre * sign_pre[None, :]) @ state.weights.hidden)
     signed_output = _signed_output(config, params, state.weights)
 
@@ -194,6 +203,28 @@ def window(
     return *remember(config, params, stdp, state, pre, spikes, keep), spikes
 
 
+def _by_products(
+    config: NetworkConfig,
+    params: NetworkParams,
+    stdp: STDPKernel,
+    state: NetworkState,
+    pre: Array,
+    spikes: Spikes,
+    keep: float | Array,
+) -> tuple[STDPState, STDPState, Array, Array]:
+    """Traces and integrals of the eligibility of both layers after a window."""
+    inputs, hidden = _centred(params, state, pre, spikes.hidden)
+    stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, inputs, spikes.hidden, keep)
+    stdp_output, second = jax.vmap(stdp_window, in_axes=(None, 0, 1, 1, None))(
+        stdp,
+        state.stdp_output,
+        hidden.reshape(-1, 2, config.n_half),
+        spikes.output[:, :, None],
+        keep,
+    )
+    return stdp_hidden, stdp_output, first, second
+
+
 def remember(
     config: NetworkConfig,
     params: NetworkParams,
@@ -208,15 +239,16 @@ def remember(
     Returns:
         The state with new traces and running means, and the eligibility of the window.
     """
-    inputs, hidden = _centred(params, state, pre, spikes.hidden)
-    stdp_hidden, first = stdp_window(stdp, state.stdp_hidden, inputs, spikes.hidden, keep)
-    stdp_output, second = jax.vmap(stdp_window, in_axes=(None, 0, 1, 1, None))(
-        stdp,
-        state.stdp_output,
-        hidden.reshape(-1, 2, config.n_half),
-        spikes.output[:, :, None],
-        keep,
-    )
+    if config.engine == "native":
+        stdp_hidden, stdp_output, first, second = native.remember(
+            params.stdp, (state.stdp_hidden, state.stdp_output), pre, *spikes,
+            (params.centring * state.baseline_input.mean,
+             params.centring * state.baseline_hidden.mean), keep, dt=config.dt,
+        )  # fmt: skip
+    else:
+        stdp_hidden, stdp_output, first, second = _by_products(
+            config, params, stdp, state, pre, spikes, keep
+        )
     duration = pre.shape[0] * config.dt
     rates = pre.mean(axis=0), spikes.hidden.mean(axis=0)
     baselines = _update_baselines(params, state, *rates, duration)

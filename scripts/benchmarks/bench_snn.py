@@ -6,9 +6,9 @@
 Unit: robot-milliseconds per CPU-second (one robot, 1 ms, all 44,308 synapses of S4 plastic), world
 and learning included, robots in blocks. Also the per-step form, the share of the GEMM peak, the
 memory per robot, where the time of a window goes, the same network put together by
-`jaxsnn.declared`, and how far weights held for a window drift from weights that change every
-millisecond. CPU time of the process, so a busy machine disturbs it little; pin it to one core.
-About three CPU-minutes, half of it compiling.
+`jaxsnn.declared`, the engine "native" beside XLA's, and how far weights held for a window drift
+from weights that change every millisecond. CPU time of the process, so a busy machine disturbs it
+little; pin it to one core. About four CPU-minutes, half of it compiling.
 """
 
 from __future__ import annotations
@@ -88,7 +88,9 @@ def flops_per_robot_ms(n_in: int, n_hidden: int, window: int) -> float:
     return inputs + pairs + learning
 
 
-def window_program(robots: int, bench: Bench, control_steps: int) -> tuple[Any, tuple, Any]:
+def window_program(
+    robots: int, bench: Bench, control_steps: int, engine: str = "xla"
+) -> tuple[Any, tuple, Any]:
     """A jitted phase of exactly `control_steps` steps per robot, its arguments and config."""
     import jax
     import jax.numpy as jnp
@@ -98,7 +100,7 @@ def window_program(robots: int, bench: Bench, control_steps: int) -> tuple[Any, 
     from jaxsnn.presets import preset
     from jaxsnn.trials import run_phase
 
-    size = {"control_steps": bench.window, "hold_steps": bench.window}
+    size = {"control_steps": bench.window, "hold_steps": bench.window, "engine": engine}
     config, constants = preset("S4", "tuned", config=size)
     agent, params = snn_agent(config), snn_params(config, constants)
     # A robot that stands still neither arrives nor collides: every trial has all its steps.
@@ -122,20 +124,25 @@ def window_program(robots: int, bench: Bench, control_steps: int) -> tuple[Any, 
     return jax.jit(run, donate_argnums=0), (make, keys), config
 
 
-def bench_window(robots: int, bench: Bench) -> float:
-    """Robot-ms per CPU-second of the window form in a closed loop."""
+def bench_window(robots: int, bench: Bench, engines: tuple[str, ...] = ("xla",)) -> list[float]:
+    """Robot-ms per CPU-second of the window form in a closed loop, engines by turns."""
+    import jax
+
     # States are copied in and out once per call: with few control steps that would be measured.
     control_steps = max(16, bench.control_steps * 64 // robots)
-    run, (make, keys), config = window_program(robots, bench, control_steps)
-    state, steps = run(make(keys), keys)
-    held = [state]
-
-    def call() -> Any:
-        held[0], done = run(held[0], keys)
-        return done
-
-    seconds = cpu_time(call, bench.repeats)
-    return float(steps.sum()) * config.control_steps / seconds
+    runs, held = [], []
+    for engine in engines:
+        run, (make, keys), config = window_program(robots, bench, control_steps, engine)
+        runs.append(run)
+        held.append(run(make(keys), keys))
+    times: list[list[float]] = [[] for _ in engines]
+    work = float(held[0][1].sum()) * config.control_steps
+    for _ in range(bench.repeats):
+        for i, run in enumerate(runs):
+            start = time.process_time()
+            held[i] = jax.block_until_ready(run(held[i][0], keys))
+            times[i].append(time.process_time() - start)
+    return [work / sorted(t)[len(t) // 2] for t in times]
 
 
 def bench_step(robots: int, bench: Bench) -> float:
@@ -212,6 +219,13 @@ def declared_share(bench: Bench) -> dict[str, float]:
     return {n: 1e6 / t for n, t in took.items()} | {"ratio": took["by_hand"] / took["declared"]}
 
 
+def native_share(bench: Bench) -> dict[str, float]:
+    """Robot-ms per CPU-second of `jaxsnn.native` and of the matrix products, by turns."""
+    robots = min(bench.robots, key=lambda n: abs(n - 64))
+    xla, native = bench_window(robots, bench, ("xla", "native"))
+    return {"robots": robots, "xla": xla, "native": native, "ratio": native / xla}
+
+
 def memory_per_robot(bench: Bench) -> dict[str, float]:
     """Bytes per robot: the state, and the peak of the compiled phase of many robots."""
     import jax
@@ -253,7 +267,7 @@ def main(bench: Bench) -> dict[str, Any]:
         print(f"per-step form, {n:4d} robots, no world: {speed:9.0f} robot-ms/s")
     out["window"] = {}
     for n in bench.robots:
-        speed = bench_window(n, bench)
+        (speed,) = bench_window(n, bench)
         out["window"][n] = speed
         print(
             f"window form,   {n:4d} robots, closed loop: {speed:9.0f} robot-ms/s, "
@@ -269,6 +283,9 @@ def main(bench: Bench) -> dict[str, Any]:
         f"declared, without a world: {out['declared']['declared']:.0f} robot-ms/s, "
         f"{out['declared']['ratio']:.2f} x the network by hand"
     )
+    out["native"] = native_share(bench)
+    print("engine native, closed loop: {native:.0f} robot-ms/s, {ratio:.2f} x XLA's".format(
+        **out["native"]))  # fmt: skip
     out["first_call_cpu_s"] = first_call()
     print(f"first call of run_experiment without a cache: {out['first_call_cpu_s']:.1f} CPU-s")
     out["memory_bytes_per_robot"] = memory_per_robot(bench)

@@ -74,7 +74,7 @@ def check_contents(wheel: Path) -> int:
     archive = zipfile.ZipFile(wheel)
     names = archive.namelist()
     needed = [f"{package}/py.typed" for package in PACKAGES]
-    needed.append("snn_fusion_failure/results/source_tables.json")
+    needed += ["snn_fusion_failure/results/source_tables.json", "jaxsnn/native/window.cc"]
     for name in needed:
         if name not in names:
             raise ValueError(f"{wheel.name} lacks {name}")

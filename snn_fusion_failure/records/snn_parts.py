@@ -31,10 +31,10 @@ def first_call() -> float:
     return float(made.stdout.split()[-1])
 
 
-def _s4(window: int) -> tuple[Any, Any]:
+def _s4(window: int, engine: str = "xla") -> tuple[Any, Any]:
     from jaxsnn.presets import preset
 
-    size = {"control_steps": window, "hold_steps": window}
+    size = {"control_steps": window, "hold_steps": window, "engine": engine}
     return preset("S4", "tuned", config=size)
 
 
@@ -44,7 +44,9 @@ def _rates(config: Any) -> Any:
     return jnp.full(config.n_in, 50.0)
 
 
-def by_hand(robots: int, window: int, part: str = "learning") -> tuple[Callable[..., Any], Any]:
+def by_hand(
+    robots: int, window: int, part: str = "learning", engine: str = "xla"
+) -> tuple[Callable[..., Any], Any]:
     """A jitted chain of windows of S4 up to a part, without a world, and the states it takes.
 
     Args:
@@ -52,6 +54,7 @@ def by_hand(robots: int, window: int, part: str = "learning") -> tuple[Callable[
         window: steps.
         part: "spikes" (input spikes are drawn), "neurons" (and both layers run) or "learning" (and
             the weights change by their eligibility).
+        engine: of `NetworkConfig`.
 
     Returns:
         `(states, keys) -> states` and the first states.
@@ -62,7 +65,7 @@ def by_hand(robots: int, window: int, part: str = "learning") -> tuple[Callable[
     from jaxsnn import network
     from jaxsnn.encoding import poisson_spikes
 
-    config, params = _s4(window)
+    config, params = _s4(window, engine)
     kernel = jax.jit(lambda: network.kernel(config, params))()
 
     def one(state: Any, key: Any) -> Any:

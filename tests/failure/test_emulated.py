@@ -161,7 +161,8 @@ def test_refined_importance_sampling_stops_by_itself_and_covers(gradients) -> No
     assert found.estimate.known
     assert found.estimate.lower <= problem.probability <= found.estimate.upper
     assert found.estimate.n_simulations <= 160
-    assert (found.n_gradients == found.estimate.n_simulations) == gradients
+    # One value looks at the opposite side.
+    assert (found.n_gradients + 1 == found.estimate.n_simulations) == gradients
 
 
 @pytest.mark.slow

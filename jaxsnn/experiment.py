@@ -6,6 +6,7 @@ depend on `i` alone.
 
 from __future__ import annotations
 
+import functools
 from collections.abc import Callable, Sequence
 from typing import Any, NamedTuple
 
@@ -137,10 +138,11 @@ def run_experiment(
         if weights is not None:
             states = states._replace(weights=weights)
         axes = {"params_axis": params_axis, "map_axis": map_axis, "max_steps": max_steps}
-        if one_loop:
+        if one_loop and config is not None:
+            agent = functools.partial(snn_agent, config, reward=reward)
             counts = (n_learn, n_test, n_online) if n_online else (n_learn, n_test)
             states, phases = run_phases(
-                lambda learns: snn_agent(config, reward=reward, plastic=learns),
+                lambda learns: agent(plastic=learns),
                 params, map, states, keys=split[:, 1 : 1 + len(counts)], n_trials=counts,
                 plastic=(True, False, True)[: len(counts)], circles=circles, record=record, **axes,
             )  # fmt: skip

@@ -157,12 +157,12 @@ def fire(
     sign_pre, _ = neuron_signs(config)
     if config.engine == "native":
         native.check(state.weights.hidden)
-        (hidden, output), *spikes = native.fire(
+        (hidden, output), *fired = native.fire(
             (params.hidden, params.output), (state.hidden, state.output), state.weights.hidden,
             _signed_output(config, params, state.weights), jnp.asarray(sign_pre),
             params.gain_input, pre, dt=config.dt,
         )  # fmt: skip
-        return state._replace(hidden=hidden, output=output), Spikes(*spikes)
+        return state._replace(hidden=hidden, output=output), Spikes(*fired)
     jumps = params.gain_input * ((pre * sign_pre[None, :]) @ state.weights.hidden)
     signed_output = _signed_output(config, params, state.weights)
 

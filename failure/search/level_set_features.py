@@ -31,7 +31,7 @@ class LevelSetFeatures(NamedTuple):
     scale: Array
     network: revnet.RevNetParams
     middle: Array
-    width: Array
+    width: float | Array
     rest: Array
 
     def _map(self) -> level_sets.LevelSets:

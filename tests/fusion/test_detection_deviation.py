@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from pathlib import Path
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -9,6 +11,7 @@ import pytest
 from scipy.spatial.distance import mahalanobis
 
 from fusion.detection.learning import with_clean_readings
+from fusion.detection.learning.checkpoints import Checkpoints
 from fusion.detection.learning.examples import make_example
 from fusion.detection.learning.training import DetectorTrainConfig, init_training
 from fusion.detection.presets import preset
@@ -74,3 +77,13 @@ def test_a_training_begins_with_the_clean_readings(model: str) -> None:
     assert jax.tree.structure(state) == jax.tree.structure(known)
     shapes = [jax.tree.map(lambda a: (a.shape, a.dtype), s) for s in (state, known)]
     assert shapes[0] == shapes[1]
+
+
+def test_a_checkpoint_of_another_version_is_named(tmp_path: Path) -> None:
+    checkpoints = Checkpoints(tmp_path)
+    checkpoints.save(1, {"gate": jnp.zeros(2)}, [])
+    with pytest.raises(ValueError, match=r"step 1: its parameters are not those .* train it anew"):
+        checkpoints.restore({"gate": jnp.zeros(2), "clean": jnp.zeros(3)})
+    step, state, _ = checkpoints.restore({"gate": jnp.ones(2)})
+    checkpoints.close()
+    assert step == 1 and float(state["gate"].sum()) == 0.0

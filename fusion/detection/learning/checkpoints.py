@@ -15,6 +15,7 @@ class Checkpoints:
 
         self._ocp = ocp
         options = ocp.CheckpointManagerOptions(max_to_keep=2, enable_async_checkpointing=False)
+        self._folder = folder
         self._manager = ocp.CheckpointManager(folder.resolve(), options=options)
 
     def save(self, step: int, state: Any, history: list[dict[str, float]]) -> None:
@@ -32,15 +33,23 @@ class Checkpoints:
 
         Args:
             like: a state of the same structure and shapes.
+
+        Raises:
+            ValueError: the checkpoint holds other parameters, those of an older version.
         """
         step = self._manager.latest_step()
         if step is None:
             return None
         args = self._ocp.args
-        held = self._manager.restore(
-            step,
-            args=args.Composite(state=args.StandardRestore(like), history=args.JsonRestore()),
-        )
+        wanted = args.Composite(state=args.StandardRestore(like), history=args.JsonRestore())
+        try:
+            held = self._manager.restore(step, args=wanted)
+        except (ValueError, KeyError) as error:
+            raise ValueError(
+                f"{self._folder}, step {step}: its parameters are not those of this model and "
+                f"version ({str(error).splitlines()[0]}); train it anew, or with the version that "
+                "made it"
+            ) from error
         return step, held["state"], list(held["history"])
 
     def close(self) -> None:

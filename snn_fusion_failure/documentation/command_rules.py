@@ -53,6 +53,10 @@ RULES = (
         for study in ("driver_heads", "driver_tagged", "driver_trip")
     ),
     Rule(
+        "study_sensors.py gate_targets",
+        "--preset quick --seeds 1 --models argate_l --rows masks --results runs",
+    ),
+    Rule(
         "study_sensors.py",
         "--preset quick --seeds 1 --models argate_plus --rows zero --results runs",
     ),

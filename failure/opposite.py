@@ -26,14 +26,24 @@ def wide_scale(beta: float) -> float:
     return float(np.clip(beta / REACH, 1.5, 4.0))
 
 
+def opposite_sides_fail(
+    performance: Performance | Counted,
+    threshold: float,
+    axes: Float[np.ndarray, "k D"],
+    betas: Float[np.ndarray, " k"],
+) -> Bool[np.ndarray, " k"]:
+    r"""Whether :math:`-(\beta + 1/2)\, a` fails as well, of k regions, a simulation each."""
+    return fails(performance, threshold, -(betas + 0.5)[:, None] * axes)
+
+
 def opposite_side_fails(
     performance: Performance | Counted,
     threshold: float,
     axis: Float[np.ndarray, " D"],
     beta: float,
 ) -> bool:
-    r"""Whether :math:`-(\beta + 1/2)\, a` fails as well: one simulation that shows a window."""
-    return bool(fails(performance, threshold, -(beta + 0.5) * axis[None])[0])
+    """The same of one region: one simulation that shows a window."""
+    return bool(opposite_sides_fail(performance, threshold, axis[None], np.array([beta]))[0])
 
 
 OPPOSITE = (

@@ -26,7 +26,7 @@ from failure.estimates import (
 from failure.form import design_points, merge_points
 from failure.hlrf import DesignPoint, find_design_point
 from failure.lines import line_sampling
-from failure.opposite import fails
+from failure.opposite import opposite_sides_fail
 from failure.performances import Performance
 from failure.subset import subset_simulation
 
@@ -192,8 +192,8 @@ def importance_sampling(
 
 def _mirrored(performance: Performance, threshold: float, points: np.ndarray) -> int:
     """Points whose mirror image, half a sigma farther out, fails and is none of them."""
-    lengths = np.maximum(np.linalg.norm(points, axis=1, keepdims=True), 1e-300)
-    axes = points / lengths
-    failing = fails(performance, threshold, -axes * (lengths + 0.5))
+    lengths = np.maximum(np.linalg.norm(points, axis=1), 1e-300)
+    axes = points / lengths[:, None]
+    failing = opposite_sides_fail(performance, threshold, axes, lengths)
     known = np.any(axes @ axes.T < -ALIKE, axis=1)
     return int(np.sum(failing & ~known))

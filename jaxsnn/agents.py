@@ -275,36 +275,31 @@ def snn_agent(
         next_reading: Reading | None,
         active: Bool[Array, ""],
     ) -> NetworkState:
-        given = params.network, state, memory, outcome, next_reading, active
-        return _where(plastic, lambda: rewarded(*given), lambda: state)
+        constants = params.network
 
-    def rewarded(
-        constants: NetworkParams,
-        state: NetworkState,
-        memory: SNNMemory,
-        outcome: Outcome,
-        next_reading: Reading | None,
-        active: Bool[Array, ""],
-    ) -> NetworkState:
-        observed = memory.reading
-        if config.reward_timing == "after" and next_reading is not None:
-            observed = next_reading
-        given = reward_of(constants, observed, memory.eligibility, memory.recent_turn)
-        end = terminal_reward(constants.reward, outcome.collided, outcome.arrived)
-        ended = outcome.collided | outcome.arrived
-        if foresees and next_reading is not None:
-            state, error = foresee(constants, state, memory, next_reading, end, ended, active)
-            given = jnp.where(ended, 0.0, given) + credited(
-                constants.critic, error, memory.turn, config.credit
+        def rewarded() -> NetworkState:
+            observed = memory.reading
+            if config.reward_timing == "after" and next_reading is not None:
+                observed = next_reading
+            given = reward_of(constants, observed, memory.eligibility, memory.recent_turn)
+            end = terminal_reward(constants.reward, outcome.collided, outcome.arrived)
+            ended = outcome.collided | outcome.arrived
+            held = state
+            if foresees and next_reading is not None:
+                held, error = foresee(constants, state, memory, next_reading, end, ended, active)
+                given = jnp.where(ended, 0.0, given) + credited(
+                    constants.critic, error, memory.turn, config.credit
+                )
+            else:
+                given = jnp.where(ended, end, given)
+            going = active.astype(held.weights.hidden.dtype)
+            learning = going * learning_share(constants, held)
+            weights = network.reinforce(
+                config, constants, held.weights, memory.eligibility, given, learning
             )
-        else:
-            given = jnp.where(ended, end, given)
-        going = active.astype(state.weights.hidden.dtype)
-        learning = going * learning_share(constants, state)
-        weights = network.reinforce(
-            config, constants, state.weights, memory.eligibility, given, learning
-        )
-        return state._replace(weights=weights, updates=state.updates + going)
+            return held._replace(weights=weights, updates=held.updates + going)
+
+        return _where(plastic, rewarded, lambda: state)
 
     def finite(state: NetworkState) -> Bool[Array, ""]:
         # A weight that is not a number makes the potential of its neuron one that is not.

@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Callable
-from typing import Any
 
 import jax
+import jax.numpy as jnp
 import numpy as np
 from jaxtyping import PRNGKeyArray
 
@@ -22,11 +22,6 @@ from fusion.detection.sensors.quality import quality_statistics
 
 MOST_FRAMES = 256
 _DRAWS = 8  # of each frame, of few
-
-
-def reads_statistics(params: Any) -> bool:
-    """Whether the network compares its readings with clean ones."""
-    return "clean" in params["main"]
 
 
 def with_clean_readings(
@@ -47,7 +42,7 @@ def with_clean_readings(
             are read, at even distances.
         key: of flips, turns and colours.
     """
-    if not reads_statistics(state.params):
+    if "clean" not in state.params["main"]:
         return state
     working = dataclasses.replace(train, failure_share=0.0)
 
@@ -57,16 +52,14 @@ def with_clean_readings(
         return quality_statistics(config.bev, inputs.image[None], inputs.bev[None])
 
     draws = min(MOST_FRAMES, _DRAWS * n_frames)
-    frames = (
-        np.arange(draws) * n_frames // draws if n_frames > draws else np.arange(draws) % n_frames
-    )
+    frames = np.arange(draws) * n_frames // draws  # at even distances; of few each several times
     rows = [
         statistics(read(int(i)), jax.random.fold_in(key, draw)) for draw, i in enumerate(frames)
     ]
     clean = dict(state.params["main"]["clean"])
     for k, sensor in enumerate(("camera", "lidar")):
         fitted = fit_clean(np.concatenate([np.asarray(row[k]) for row in rows]))
-        clean[f"{sensor}_mean"] = jax.numpy.asarray(fitted.mean)
-        clean[f"{sensor}_whiten"] = jax.numpy.asarray(fitted.whiten)
+        clean[f"{sensor}_mean"] = jnp.asarray(fitted.mean)
+        clean[f"{sensor}_whiten"] = jnp.asarray(fitted.whiten)
     main = state.params["main"] | {"clean": clean}
     return state._replace(params=state.params | {"main": main})

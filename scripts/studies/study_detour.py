@@ -2,6 +2,7 @@
 
     python scripts/studies/study_detour.py --models blind reflex_60 reflex_100 q_learning
     python scripts/studies/study_detour.py --models S4 S4_literal S1 S2 S3 --seeds 16
+    python scripts/studies/study_detour.py --models S2_way --seeds 64 --engine native
     python scripts/studies/study_detour.py --models S4_way --seeds 8 --choose
 
 Rows are the three scenarios, their detour readings D1 to D3 (`jaxsnn.scenarios.detour`) and the
@@ -28,7 +29,7 @@ from __future__ import annotations
 import dataclasses
 import functools
 import time
-from typing import Any
+from typing import Any, Literal
 
 from snn_fusion_failure.records.detour_rows import (
     ROWS,
@@ -84,6 +85,8 @@ class Study:
     """Training maps that are compared (`--choose`)."""
     max_steps: int = 200
     block: int = 8
+    engine: Literal["xla", "native"] = "xla"
+    """What computes the networks' windows; native is faster (`jaxsnn.native`)."""
     max_minutes: float = 25.0
     """No row is begun after so many minutes of CPU time."""
 
@@ -123,6 +126,7 @@ def run_network(config: Study, model: str, row: str) -> dict[str, list[float]]:
 
     name, _, reading = model.partition("_")
     network, params = preset(name, reading or "tuned")
+    network = dataclasses.replace(network, engine=config.engine)
     states = learn_on(
         network, params, train_map(row), _seeds(config),
         scenario=1 if is_family(row) else int(row[-1]), n_learn=config.learn_trials,

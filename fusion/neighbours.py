@@ -16,8 +16,8 @@ from fusion.tables import codes
 
 EPSILON = 1e-3
 """Probability that every class keeps, so that its logarithm is bounded."""
-CHUNK = 128
-"""Examples that are compared with the whole memory at once; bounds what has to be held."""
+EXAMPLES, ROWS = 512, 1024
+"""Examples and rows in memory that are compared at once: a tile that a core's cache holds."""
 
 
 class Memory(NamedTuple):
@@ -89,21 +89,44 @@ def neighbour_probabilities(
         axis=1,
     )
     classes = jax.nn.one_hot(labels, n_classes, dtype=features.dtype)
+    if excluded is None:
+        return _tiled_shares(sharpness * query, known, classes)
+    score = jnp.where(excluded, jnp.finfo(features.dtype).min, sharpness * (query @ known.T))
+    top = jax.lax.stop_gradient(jnp.max(score, axis=-1, keepdims=True))
+    found = jnp.exp(score - top) @ classes
+    return found / jnp.sum(found, axis=-1, keepdims=True)
 
-    def shares(query: Array, excluded: Array | None) -> Array:
-        score = sharpness * (query @ known.T)
-        if excluded is not None:
-            score = jnp.where(excluded, jnp.finfo(score.dtype).min, score)
-        top = jax.lax.stop_gradient(jnp.max(score, axis=-1, keepdims=True))
-        found = jnp.exp(score - top) @ classes
+
+def _tiled_shares(
+    query: Float[Array, "b f"], known: Float[Array, "m f"], classes: Float[Array, "m c"]
+) -> Float[Array, "b c"]:
+    """`softmax(query @ known.T) @ classes`, in tiles: the sums move to each new largest score.
+
+    Source: Milakov and Gimelshein (2018), Online normalizer calculation for softmax.
+    """
+    (b, _), (m, c) = query.shape, classes.shape
+    examples, rows = min(EXAMPLES, b), min(ROWS, m)
+    # Rows that fill up the last tile repeat a true one, so no largest score changes, and count for
+    # no class.
+    known = jnp.pad(known, ((0, -m % rows), (0, 0)), mode="edge").reshape(-1, rows, known.shape[1])
+    classes = jnp.pad(classes, ((0, -m % rows), (0, 0))).reshape(-1, rows, c)
+    tiles = jnp.pad(query, ((0, -b % examples), (0, 0))).reshape(-1, examples, query.shape[1])
+
+    def shares(query: Array) -> Array:
+        def add(held: tuple[Array, Array], tile: tuple[Array, Array]) -> Any:
+            top, found = held
+            known, classes = tile
+            score = query @ known.T
+            largest = jax.lax.stop_gradient(jnp.max(score, axis=-1, keepdims=True))
+            new = jnp.maximum(top, largest)
+            return (new, found * jnp.exp(top - new) + jnp.exp(score - new) @ classes), None
+
+        lowest = jnp.full((examples, 1), jnp.finfo(query.dtype).min)
+        start = lowest, jnp.zeros((examples, c), query.dtype)
+        (_, found), _ = jax.lax.scan(add, start, (known, classes))
         return found / jnp.sum(found, axis=-1, keepdims=True)
 
-    if excluded is not None or b <= 2 * CHUNK:
-        return shares(query, excluded)
-    count = -(-b // CHUNK)
-    padded = jnp.pad(query, ((0, count * CHUNK - b), (0, 0)))
-    found = jax.lax.map(lambda q: shares(q, None), padded.reshape(count, CHUNK, -1))
-    return found.reshape(-1, n_classes)[:b]
+    return jax.lax.map(shares, tiles).reshape(-1, c)[:b]
 
 
 def read_memory(main: dict[str, Any]) -> tuple[dict[str, Any], Memory | None]:

@@ -41,7 +41,7 @@ def _single_runs(folder: Path, field: str) -> Iterator[tuple[str, str, str, dict
     """Single runs that keep `field`, as (table, row, model, record), in the order of the tables."""
     for table, (_, rows) in fusion_tables.TABLES.items():
         for row in rows:
-            for model in (*fusion_tables.FIVE, *row.references):
+            for model in row.models:
                 where = fusion_tables.Run(table, row, model, 0).path(folder).parent
                 for path in sorted(where.glob("*.json"), key=lambda p: int(p.stem)):
                     record = load(path)

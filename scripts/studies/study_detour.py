@@ -20,8 +20,8 @@ map is worth as a teacher (`results/study_detour_choice.json`).
 The network "S4_way" is compared with the drivers robot by robot (`comparisons`: paired t tests,
 Holm's correction over all of them). Rows go to `results/study_detour.json` as each one ends; one
 that is there already with as many seeds is skipped, so the study can be broken off and gone on
-with. Drivers take seconds, Q-learning two CPU-minutes per row, a network about 10 CPU-seconds per
-seed and row.
+with. Drivers take seconds, Q-learning two CPU-minutes per row, a network two CPU-seconds per
+seed and row, with `--engine native` one.
 """
 
 from __future__ import annotations

@@ -82,8 +82,9 @@ def trivial(name: str, dataset: Dataset, noise: Corruption, seed: int) -> dict[s
     """Accuracy of a learner without a gate on the same corrupted rows.
 
     Args:
-        name: `nearest_rows` looks up the five training rows that are nearest in the ranks of all
-            sensors, failed or not; `linear_fit` is a logistic regression of corrupted rows.
+        name: `nearest_rows` looks up the five training rows that are nearest in all sensors, failed
+            or not (in their ranks where they are scalars); `linear_fit` is a logistic regression of
+            corrupted rows.
         dataset, noise, seed: as in a training of ours; the same test rows.
 
     Raises:
@@ -108,8 +109,11 @@ def trivial(name: str, dataset: Dataset, noise: Corruption, seed: int) -> dict[s
         # The file has one driver after the other: its first rows are those of the first.
         drawn = np.random.default_rng(seed).permutation(len(labels))[:KNN_ROWS]
         queries, labels, mask = queries[drawn], labels[drawn], mask[drawn]
-        known = np.sort(dataset.train_x[:, :, 0], axis=0)
-        train, queries = (_ranks(known, a[:, :, 0]) for a in (dataset.train_x, queries))
+        train = dataset.train_x
+        if dataset.n_time == 1:
+            known = np.sort(train[:, :, 0], axis=0)
+            train, queries = (_ranks(known, a[:, :, 0]) for a in (train, queries))
+        train, queries = (a.reshape(len(a), -1) for a in (train, queries))
         model = KNeighborsClassifier(5, algorithm="brute").fit(train, dataset.train_y)
     else:
         from sklearn.linear_model import LogisticRegression
@@ -118,8 +122,9 @@ def trivial(name: str, dataset: Dataset, noise: Corruption, seed: int) -> dict[s
         train, queries = (np.asarray(a).reshape(len(a), -1) for a in (seen, queries))
         model = LogisticRegression(max_iter=200).fit(train, dataset.train_y)
     found = split_accuracy(labels, model.predict(queries), mask)
-    scores = {"accuracy": found.overall, "accuracy_clean": found.clean}
-    return {n: 100.0 * v for n, v in (scores | {"accuracy_corrupted": found.corrupted}).items()}
+    scores = {"": found.overall, "_clean": found.clean, "_corrupted": found.corrupted}
+    # A clean row of a table has no corrupted part.
+    return {f"accuracy{part}": 100.0 * v for part, v in scores.items() if np.isfinite(v)}
 
 
 def _ranks(known: np.ndarray, x: np.ndarray) -> np.ndarray:

@@ -149,20 +149,16 @@ def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Done:
         if plan.wants(run.model)
         and (not plan.piece or (run.row.name == QUICK_ROW and run.model in QUICK_MODELS))
     ]
-    # The source's models first, seed by seed over all tables: an early stop then leaves complete
-    # tables of few seeds.
+    # Seed by seed over all tables: an early stop then leaves complete tables of few seeds.
     index, count = plan.shard
-    todo = sorted(todo, key=lambda run: (run.model not in fusion_tables.FIVE, run.seed))
+    todo = sorted(todo, key=lambda run: run.seed)
     todo = todo[index::count]
     todo = [] if plan.collect_only else [run for run in todo if not run.path(out).exists()]
     if todo:
         enable_compilation_cache()
         names = {run.row.settings["dataset"] for run in todo}
         try:
-            datasets = {
-                name: load(name, plan.data_dir, features="tagged" if name == "driver" else None)
-                for name in sorted(names)
-            }
+            datasets = {name: load(name, plan.data_dir) for name in sorted(names)}
         except FileNotFoundError as error:
             if not plan.piece:
                 raise

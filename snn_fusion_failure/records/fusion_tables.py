@@ -19,10 +19,9 @@ if TYPE_CHECKING:
 
 FIVE = ("baseline", "netgated", "argate_ws", "argate_plus", "argate_l")
 PRINTED = ("argate_plus_printed", "argate_l_printed")
-REFERENCES = ("oracle", "modality_dropout", "embracenet")
-DRIVER_REFERENCES = (*PRINTED, "oracle", *CEILINGS)
-DRIVER = {"dataset": "driver", "features": "tagged", "head": "dense"}
-"""Signals and head of Tables 3.4 to 3.6 on record; `scripts/studies/study_sensors.py` has newer."""
+ABSORBING = ("modality_dropout", "embracenet")
+"""Networks without a gate that are trained for missing sensors."""
+TRIVIAL = ("nearest_rows", "linear_fit")
 UNSEEN_KINDS: tuple[FailureKind, ...] = ("zero", "stuck", "drift", "dropout", "gain", "clip")
 
 
@@ -33,7 +32,7 @@ class Row:
     Attributes:
         name: as the source's table spells it.
         settings: fields of `train_argate.Config` that differ from its defaults.
-        references: these columns, too.
+        references: columns beside the source's.
         robustness: also score under the failure kinds that are never trained on.
         channel: keep this channel's fusion weights (Figure 3.7).
     """
@@ -44,41 +43,53 @@ class Row:
     robustness: bool = False
     channel: str | None = None
 
+    @property
+    def models(self) -> tuple[str, ...]:
+        """All columns of the row; the driver's head calls its baseline `equal_weights`."""
+        base = "equal_weights" if self.settings["dataset"] == "driver" else "baseline"
+        return (base, *FIVE[1:], *self.references)
 
-def _data(dataset: str) -> dict[str, Any]:
-    return dict(DRIVER) if dataset == "driver" else {"dataset": dataset}
+
+def _bounds(dataset: str) -> tuple[str, ...]:
+    """The trivial opponents and, of scalar sensors, the forest that is told which ones work."""
+    return (*(("forest_ceiling",) if dataset == "driver" else ()), *TRIVIAL)
 
 
-def _random(dataset: str, n_clean: int, kind: str, **options: Any) -> Row:
-    settings = _data(dataset) | {"protocol": "random", "n_clean": n_clean, "kind": kind}
-    references = (*PRINTED, *options.pop("references", ()))
-    if dataset == "driver":  # the ceilings do not depend on how sensors fail
-        references = DRIVER_REFERENCES[: None if kind == "uniform" else -len(CEILINGS)]
-    return Row(f"n_clean={n_clean} {kind}", settings, references, **options)
+def _clean(dataset: str) -> Row:
+    return Row("clean", {"dataset": dataset, "protocol": "clean"}, _bounds(dataset))
+
+
+def _random(dataset: str, n_clean: int, kind: str, *more: str, **options: Any) -> Row:
+    settings = {"dataset": dataset, "protocol": "random", "n_clean": n_clean, "kind": kind}
+    # What the forest reaches does not depend on how the other sensors fail.
+    bounds = _bounds(dataset) if kind == "uniform" else ()
+    return Row(
+        f"n_clean={n_clean} {kind}", settings, (*PRINTED, "oracle", *more, *bounds), **options
+    )
 
 
 def _ranges(dataset: str, train: tuple[int, int], test: tuple[int, int]) -> Row:
     ranges = {"protocol": "generalisation", "train_range": train, "test_range": test}
-    return Row(f"({train[0]},{train[1]})({test[0]},{test[1]})", _data(dataset) | ranges)
+    name = f"({train[0]},{train[1]})({test[0]},{test[1]})"
+    return Row(name, {"dataset": dataset} | ranges, ("oracle", *TRIVIAL))
 
 
 def _fixed(dataset: str, n_clean: int) -> Row:
-    references = ("forest_ceiling",) if dataset == "driver" else ()
-    settings = _data(dataset) | {"protocol": "fixed", "n_clean": n_clean}
-    return Row(f"n_clean={n_clean}", settings, references)
+    settings = {"dataset": dataset, "protocol": "fixed", "n_clean": n_clean}
+    return Row(f"n_clean={n_clean}", settings, ("oracle", *_bounds(dataset)))
 
 
 TABLES: dict[str, tuple[str, tuple[Row, ...]]] = {
     "3.1": (
         "HAR, clean and random failing sensor assignment, accuracy %",
         (
-            Row("clean", {"dataset": "har", "protocol": "clean"}),
-            _random("har", 8, "uniform", references=("oracle",)),
+            _clean("har"),
+            _random("har", 8, "uniform"),
             _random("har", 8, "gaussian"),
-            _random("har", 5, "uniform", references=REFERENCES, robustness=True),
+            _random("har", 5, "uniform", *ABSORBING, robustness=True),
             _random("har", 5, "gaussian"),
-            _random("har", 1, "uniform", references=REFERENCES, channel="total_acc_y"),
-            _random("har", 1, "gaussian", references=("oracle",)),
+            _random("har", 1, "uniform", *ABSORBING, channel="total_acc_y"),
+            _random("har", 1, "gaussian"),
         ),
     ),
     "3.2": (
@@ -96,7 +107,7 @@ TABLES: dict[str, tuple[str, tuple[Row, ...]]] = {
     "3.5": (
         "Driver identification, clean and random failing sensor assignment, accuracy %",
         (
-            Row("clean", DRIVER | {"protocol": "clean"}, ("forest_ceiling",)),
+            _clean("driver"),
             _random("driver", 12, "uniform"),
             _random("driver", 12, "gaussian"),
             _random("driver", 8, "uniform", robustness=True),
@@ -132,7 +143,7 @@ def runs(table: str, seeds: int) -> Iterator[Run]:
     _, rows = TABLES[table]
     for seed in range(seeds):
         for row in rows:
-            for model in (*FIVE, *row.references):
+            for model in row.models:
                 yield Run(table, row, model, seed)
 
 
@@ -250,8 +261,9 @@ def collect(
             unit = "%" if metric.startswith("accuracy") else "1"
             cell: dict[str, Any] = {"row": row, "model": model, "metric": metric, "unit": unit}
             cell |= summarize(values)
-            if metric == "accuracy" and model in printed["columns"]:
-                cell["source"] = printed["rows"][row][printed["columns"].index(model)]
+            column = "baseline" if model == "equal_weights" else model
+            if metric == "accuracy" and column in printed["columns"]:
+                cell["source"] = printed["rows"][row][printed["columns"].index(column)]
             rows.append(cell)
     for row in dict.fromkeys(name for name, _ in held):
         for better, worse in PAIRS:

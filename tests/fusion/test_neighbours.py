@@ -92,17 +92,26 @@ def test_neighbour_shares_agree_with_a_loop_over_rows() -> None:
         np.testing.assert_allclose(found[i], shares / shares.sum(), rtol=2e-5)
 
 
-def test_many_examples_in_pieces_are_the_same_as_at_once() -> None:
+@pytest.mark.parametrize(("examples", "known"), [(3, 5), (512, 1024), (530, 1030), (1, 2500)])
+@pytest.mark.parametrize("far", [0.0, 40.0])
+def test_shares_in_tiles_are_those_of_a_softmax_in_float64(
+    examples: int, known: int, far: float
+) -> None:
+    """Also where every row in memory is so far away that its share alone would be zero."""
     rng = np.random.default_rng(2)
-    e, m = (jnp.asarray(rng.normal(size=(K, n, 2)), jnp.float32) for n in (300, 20))
-    w = jnp.full((300, K), 1.0 / K)
-    y = jnp.asarray(rng.integers(0, C, 20))
-    whole = neighbour_probabilities(e, w, m, y, C, jnp.float32(1.0))
-    parts = [
-        neighbour_probabilities(e[:, i : i + 100], w[:100], m, y, C, jnp.float32(1.0))
-        for i in (0, 100, 200)
-    ]
-    np.testing.assert_allclose(whole, np.concatenate(parts), rtol=1e-5)
+    e, m = (rng.normal(size=(K, n, 2)).astype(np.float32) for n in (examples, known))
+    e += np.float32(far)
+    w = rng.dirichlet(np.ones(K), examples).astype(np.float32)
+    y = rng.integers(0, C, known)
+    found = neighbour_probabilities(*map(jnp.asarray, (e, w, m, y)), C, jnp.float32(0.5))
+    d = np.stack(
+        [K * ((a[:, None].astype(np.float64) - m) ** 2).sum(-1) for a in e.transpose(1, 0, 2)]
+    )
+    score = -0.5 * np.einsum("bk,bkm->bm", w, d)
+    share = np.exp(score - score.max(1, keepdims=True)) @ np.eye(C)[y]
+    np.testing.assert_allclose(
+        found, share / share.sum(1, keepdims=True), atol=2e-3 if far else 1e-5
+    )
 
 
 def test_a_sensor_of_weight_zero_has_no_influence() -> None:

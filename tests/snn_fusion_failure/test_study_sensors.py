@@ -13,7 +13,7 @@ import pytest
 from fusion.data import from_arrays, load
 from fusion.failures import no_failure
 from fusion.loop import Corruption
-from snn_fusion_failure.records import ceilings, sensor_cases
+from snn_fusion_failure.records import ceilings, fusion_tables, sensor_cases
 from snn_fusion_failure.runs import write_json
 from tests._scripts import load_script
 
@@ -134,3 +134,18 @@ def test_neighbours_are_looked_up_for_drawn_rows(monkeypatch: pytest.MonkeyPatch
     protocol = no_failure(data.channels)
     found = ceilings.score("nearest_rows", data, Corruption(protocol, protocol), 0)
     assert 35.0 < found["accuracy"] < 65.0
+
+
+@pytest.mark.parametrize("name", fusion_tables.TRIVIAL)
+def test_trivial_learners_read_whole_windows(name: str) -> None:
+    """Classes that only the last sample tells; a clean row has no corrupted part."""
+    pytest.importorskip("sklearn", reason="ceilings need the extra sklearn")
+    rng = np.random.default_rng(0)
+    y = np.arange(400) % 2
+    x = 0.1 * rng.normal(size=(400, 1, 4)).astype(np.float32)
+    x[:, 0, -1] += y
+    data = from_arrays(x, y)
+    protocol = no_failure(data.channels)
+    found = ceilings.score(name, data, Corruption(protocol, protocol), 0)
+    assert found["accuracy"] == found["accuracy_clean"] > 95.0
+    assert "accuracy_corrupted" not in found

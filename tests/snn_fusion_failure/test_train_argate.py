@@ -238,7 +238,27 @@ def test_every_run_has_a_file_and_a_number_of_the_source() -> None:
         assert [row.name for row in rows] == list(source[table]["rows"])
         paths += [run.path(Path()) for run in fusion_tables.runs(table, 2)]
     # Rows x models and references, for two seeds.
-    assert len(set(paths)) == len(paths) == 2 * (55 + 10 + 15 + 12 + 63 + 5)
+    assert len(set(paths)) == len(paths) == 2 * (65 + 16 + 24 + 18 + 65 + 8)
+
+
+def test_every_row_stands_between_a_trivial_opponent_and_a_bound() -> None:
+    for table, (_, rows) in fusion_tables.TABLES.items():
+        for row in rows:
+            assert ("equal_weights" in row.models) == (row.settings["dataset"] == "driver")
+            if "gaussian" not in row.name:
+                assert set(fusion_tables.TRIVIAL) <= set(row.models), (table, row.name)
+            if row.name != "clean":  # where nothing fails a gate has nothing to be told
+                assert "oracle" in row.models, (table, row.name)
+
+
+def test_the_baseline_of_the_new_head_carries_the_sources_baseline(tmp_path: Path) -> None:
+    row = fusion_tables.TABLES["3.6"][1][0]
+    record = dict.fromkeys(fusion_tables.METRICS, 0.5)
+    write_json(Run("3.6", row, "equal_weights", 0).path(tmp_path), record)
+    source = json.loads((repository.RESULTS / "source_tables.json").read_text())
+    rows, _ = fusion_tables.collect("3.6", tmp_path, 1, source)
+    (cell,) = [r for r in rows if r["metric"] == "accuracy"]
+    assert cell["source"] == source["3.6"]["rows"][row.name][0]
 
 
 def test_a_table_pairs_runs_by_seed(tmp_path: Path) -> None:

@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 from failure.descents import Descent, by_gradients, by_values
 from failure.estimates import GOOD, Estimate, check_threshold, mean_of_terms
 from failure.models.emulator import Emulator
-from failure.opposite import OPPOSITE, opposite_side_fails
+from failure.opposite import OPPOSITE, opposite_sides_fail
 from failure.performances import Counted, Performance, Slopes
 
 BAND = 2.0
@@ -146,7 +146,8 @@ def ak_sampling(
             "predicted: the emulator is wrong about its error; use line_sampling"
         )
         lower, upper = 0.0, 1.0
-    if opposite_side_fails(performance, threshold, u / np.linalg.norm(u), float(np.linalg.norm(u))):
+    length = float(np.linalg.norm(u))
+    if opposite_sides_fail(performance, threshold, u[None] / length, np.array([length]))[0]:
         reasons.append(OPPOSITE)
         upper = 1.0
     spent += 1

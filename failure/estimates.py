@@ -125,6 +125,8 @@ def add(parts: Sequence[Estimate]) -> Estimate:
         for k, e in enumerate(parts)
         if not e.known
     ]
+    if len(reasons) > 2:
+        reasons[1:] = [f"{len(reasons) - 1} further regions are in doubt, too"]
     if total > 0.0 and not reasons:
         lower, upper = log_normal_interval(total, error, 1.0)
         lower, upper = min(lower, total / 1.01), max(upper, min(1.0, 1.01 * total))

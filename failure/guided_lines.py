@@ -13,7 +13,13 @@ from failure.descents import Descent, by_values, cosine_of
 from failure.estimates import GOOD, Estimate, check_threshold
 from failure.line_roots import bend_of_lines
 from failure.lines import BEND, interval_of_lines
-from failure.opposite import OPPOSITE, opposite_side_fails, wide_strangers
+from failure.opposite import (
+    OPPOSITE,
+    check_scan,
+    opposite_sides_fail,
+    strangers_found,
+    wide_strangers,
+)
 from failure.performances import Counted, Performance
 from failure.single_lines import room_for_bend, roots_by_values
 from failure.tilted_plane import TiltedPlane
@@ -86,12 +92,13 @@ def guided_lines(
 
     Raises:
         ValueError: a threshold that is not finite, a factor not above 1, a share that is not in
-            (0, 1], a budget below D + 30.
+            (0, 1], a budget below D + 30, a scan below 0.
 
     Source: Koutsourelakis, Pradlwarter and Schueller (2004); de Angelis, Patelli and Beer (2015)
     for lines whose direction is updated.
     """
     check_threshold(threshold)
+    check_scan(scan)
     if not factor > 1.0:
         raise ValueError(f"factor={factor}: expected a ratio above 1")
     if not 0.0 < share <= 1.0:
@@ -219,20 +226,16 @@ def _judge(
             f"boundary bends towards nominal ({found.bend:.2f} of the sphere's curvature); use "
             "subset_simulation beside it"
         )
-    if opposite_side_fails(counted, threshold, found.axis, found.beta):
+    region = found.axis[None], np.array([found.beta])
+    if opposite_sides_fail(counted, threshold, *region)[0]:
         further.append(OPPOSITE)
     if end.turn < TURNED:
         further.append(
             f"the slope at nominal belongs to another mechanism (cosine {end.turn:.2f}) that may "
             "fail as well; use regions.probability_by_lines"
         )
-    if scan:
-        beside = wide_strangers(counted, threshold, found.axis, found.beta, scan, key=key)
-        if beside:
-            further.append(
-                f"{beside} of {scan} wide samples fail beside the region; use "
-                "regions.probability_by_lines"
-            )
+    if beside := wide_strangers(counted, threshold, *region, scan, key=key).strange:
+        further.append(strangers_found(beside, scan))
     if further:
         # What else fails is not known, so neither is an upper end.
         upper = 1.0

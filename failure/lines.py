@@ -12,7 +12,13 @@ from jaxtyping import Array, Float, Key
 from failure.estimates import GOOD, Estimate, check_threshold, mean_of_terms
 from failure.hlrf import DesignPoint
 from failure.line_roots import bend_of_lines, curvature, line_roots
-from failure.opposite import OPPOSITE, opposite_side_fails
+from failure.opposite import (
+    OPPOSITE,
+    check_scan,
+    opposite_sides_fail,
+    strangers_found,
+    wide_strangers,
+)
 from failure.performances import Counted, Performance, Slopes
 
 BEND = 0.8
@@ -45,6 +51,7 @@ def line_sampling(
     factor: float = 2.0,
     min_lines: int = 10,
     max_lines: int = 200,
+    scan: int = 100,
 ) -> Estimate:
     r"""Probability of the region of a design point.
 
@@ -58,8 +65,9 @@ def line_sampling(
 
     The verdict is not "good", and the interval withheld or widened, when the design point failed
     its checks, when the interval did not get narrow, when few lines carry the sum, when outputs
-    are invalid, when lines run backwards (their output falls along `a`), and when the side opposite
-    to the design point fails too, which costs one value.
+    are invalid, when lines run backwards (their output falls along `a`), when the side opposite
+    to the design point fails too, which costs one value, and when one of `scan` wide samples fails
+    beside the region.
 
     Args:
         performance: `x [n, D] -> y [n]`, larger is worse.
@@ -70,27 +78,38 @@ def line_sampling(
         factor: wanted half width of the interval, as a ratio.
         min_lines: lines at least.
         max_lines: lines at most.
+        scan: wide samples that look for other regions; 100 see one of the same distance with 99 %,
+            0 trusts that there is one mechanism.
 
     Returns:
         Estimate of the region of this design point alone, see `failure.regions` for all of them;
-        `n_simulations` counts values and gradients of the lines alike, those of the design point
-        not included.
+        `n_simulations` counts values and gradients of the lines and the scan alike, those of the
+        design point not included.
 
     Raises:
-        ValueError: a threshold that is not finite, a factor not above 1, impossible lines.
+        ValueError: a threshold that is not finite, a factor not above 1, impossible lines, a scan
+            below 0.
 
     Source: Koutsourelakis, Pradlwarter and Schueller (2004).
     """
+    check_scan(scan)
     found = sample_lines(
         performance, threshold, design, key=key, slopes=slopes, factor=factor,
         min_lines=min_lines, max_lines=max_lines,
     ).estimate  # fmt: skip
     if not math.isfinite(found.probability):
         return found
-    if opposite_side_fails(performance, threshold, design.axis, design.beta):
+    region = design.axis[None], np.array([design.beta])
+    further = []
+    if opposite_sides_fail(performance, threshold, *region)[0]:
+        further.append(OPPOSITE)
+    seen = wide_strangers(performance, threshold, *region, scan, key=jax.random.fold_in(key, 1))
+    if seen.strange:
+        further.append(strangers_found(seen.strange, scan))
+    if further:
         reasons = [] if found.known else [found.verdict]
-        found = found._replace(upper=1.0, verdict="; ".join([*reasons, OPPOSITE]))
-    return found._replace(n_simulations=found.n_simulations + 1)
+        found = found._replace(upper=1.0, verdict="; ".join([*reasons, *further]))
+    return found._replace(n_simulations=found.n_simulations + 1 + seen.n_simulations)
 
 
 def sample_lines(

@@ -26,7 +26,7 @@ from failure.estimates import (
 from failure.form import design_points, merge_points
 from failure.hlrf import DesignPoint, find_design_point
 from failure.lines import line_sampling
-from failure.opposite import opposite_sides_fail
+from failure.opposite import check_scan, opposite_sides_fail, strangers_found, wide_strangers
 from failure.performances import Performance
 from failure.subset import subset_simulation
 
@@ -108,6 +108,7 @@ def importance_sampling(
     key: Key[Array, ""],
     n: int = 4000,
     defensive: float = 0.1,
+    scan: int = 100,
 ) -> Estimate:
     r"""Sample from normals moved to the failure regions, and weight each sample back.
 
@@ -116,9 +117,9 @@ def importance_sampling(
 
     The nominal part bounds every weight by :math:`1 / \alpha`. Regions that no point stands for
     are missed: the interval is that of the regions given. One more simulation for each point looks
-    at the opposite side; where it fails and no point stands there, the verdict says so and the
-    upper end is what the nominal draws alone say. With fewer than 10 effective samples
-    the interval is withheld: its lower end is 0, its upper end what the nominal draws alone say.
+    at the opposite side, and `scan` wide samples look beside all of them; where they fail, the
+    verdict says so and the upper end is what the nominal draws alone say. With fewer than 10
+    effective samples the interval is withheld: its lower end is 0, its upper end the same.
 
     Args:
         performance: `x [m, D] -> y [m]`.
@@ -128,13 +129,14 @@ def importance_sampling(
         key: random key.
         n: samples.
         defensive: :math:`\alpha`.
+        scan: wide samples that look for other regions; 0 trusts that the points stand for all.
 
     Returns:
         Estimate.
 
     Raises:
         ValueError: no point, or one that is not finite; a threshold that is not finite; a
-            nominal share that is not in (0, 1).
+            nominal share that is not in (0, 1); a scan below 0.
 
     Source: Hesterberg (1995) for the defensive mixture; Kahn and Harris (1951).
 
@@ -147,6 +149,7 @@ def importance_sampling(
         (True, 'good')
     """
     check_threshold(threshold)
+    check_scan(scan)
     if not 0.0 < defensive < 1.0:
         raise ValueError(f"defensive={defensive}: expected a share in (0, 1)")
     centres = np.asarray(points, np.float64)
@@ -179,21 +182,33 @@ def importance_sampling(
         # The share counts only where a failure could be: near the points almost everywhere.
         reasons.append(f"{invalid} of {n} outputs are invalid: they count as no failure")
         upper = max(upper, float(np.mean(weight * (failed | ~np.isfinite(y)))))
-    beside = _mirrored(performance, float(threshold), centres)
-    if beside:
-        reasons.append(
-            f"{beside} of {k} points fail on the opposite side as well, where none of them stands: "
-            "add design points of that side"
-        )
+    further, spent = _further_regions(performance, float(threshold), centres, scan, key)
+    if further:
         upper = max(upper, certain)
-    verdict = "; ".join(reasons) or GOOD
-    return Estimate(mean, lower, upper, n + k, invalid, effective, verdict)
+    verdict = "; ".join([*reasons, *further]) or GOOD
+    return Estimate(mean, lower, upper, n + spent, invalid, effective, verdict)
 
 
-def _mirrored(performance: Performance, threshold: float, points: np.ndarray) -> int:
-    """Points whose mirror image, half a sigma farther out, fails and is none of them."""
+def _further_regions(
+    performance: Performance, threshold: float, points: np.ndarray, scan: int, key: Key[Array, ""]
+) -> tuple[list[str], int]:
+    """What speaks for regions that no point stands for: mirror images and wide samples that fail.
+
+    A mirror image is looked at half a sigma farther out, and counts where it is none of the points.
+    The simulations are returned beside the reasons.
+    """
     lengths = np.maximum(np.linalg.norm(points, axis=1), 1e-300)
     axes = points / lengths[:, None]
     failing = opposite_sides_fail(performance, threshold, axes, lengths)
-    known = np.any(axes @ axes.T < -ALIKE, axis=1)
-    return int(np.sum(failing & ~known))
+    mirrored = int(np.sum(failing & ~np.any(axes @ axes.T < -ALIKE, axis=1)))
+    found = []
+    if mirrored:
+        found.append(
+            f"{mirrored} of {len(points)} points fail on the opposite side as well, where none of "
+            "them stands: add design points of that side"
+        )
+    key = jax.random.fold_in(key, 1)
+    seen = wide_strangers(performance, threshold, axes, lengths, scan, key=key)
+    if seen.strange:
+        found.append(strangers_found(seen.strange, scan))
+    return found, len(points) + seen.n_simulations

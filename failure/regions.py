@@ -12,7 +12,7 @@ from jaxtyping import Array, Float, Key
 from failure.estimates import Estimate, add, check_threshold
 from failure.hlrf import DesignPoint, find_design_point, onto_boundary
 from failure.lines import BEND, sample_lines
-from failure.opposite import wide_scale
+from failure.opposite import beside, check_scan, explained, fails, wide_scale
 from failure.performances import Counted, Performance, Slopes
 
 ALIKE = 0.9
@@ -70,10 +70,11 @@ class _Finder:
     def _alike(a: np.ndarray, b: np.ndarray) -> bool:
         return float(a @ b) > ALIKE * float(np.linalg.norm(a) * np.linalg.norm(b))
 
-    def beside(self, x: np.ndarray) -> np.ndarray:
-        """Rows of `x` that no known region explains: short of half its distance along its axis."""
-        inside = [x @ p.axis >= 0.5 * p.beta for p in self.points]
-        return ~np.any(inside, axis=0) if inside else np.ones(len(x), bool)
+    @property
+    def known(self) -> tuple[np.ndarray, np.ndarray]:
+        """Axes `[k, D]` and distances `[k]` of the regions."""
+        axes = np.array([p.axis for p in self.points]).reshape(-1, self.dim)
+        return axes, np.array([p.beta for p in self.points])
 
 
 def probability_by_lines(
@@ -120,6 +121,7 @@ def probability_by_lines(
     the sum, an upper bound that overlaps of rare regions hardly lower.
     """
     check_threshold(threshold)
+    check_scan(scan)
     if most < 1:
         raise ValueError(f"most={most}: expected at least 1 region")
     finder = _Finder(performance, float(threshold), dim, slopes)
@@ -169,19 +171,19 @@ def probability_by_lines(
         with jax.enable_x64(True):
             wide = wide_scale(finder.points[0].beta)
             x = wide * np.asarray(jax.random.normal(keys[-1], (scan, dim)))
-        seen = fails = x[np.nan_to_num(counted(x), nan=-np.inf) > threshold]
+        seen = failing = x[fails(counted, threshold, x)]
         tried = 0
-        while len(left := fails[finder.beside(fails)]) and tried < most:
+        while len(failing := failing[beside(failing, *finder.known)]) and tried < most:
+            one, failing = failing[0], failing[1:]
+            if explained(counted, threshold, one, *finder.known):
+                continue
             tried += 1
-            inner = onto_boundary(counted, float(threshold), left[0])
+            inner = onto_boundary(counted, float(threshold), one)
             if (found := finder.find(inner)) is None or not found.converged:
-                fails = fails[np.any(fails != left[0], axis=1)]
                 doubts.append("a wide sample fails beside all regions and leads to no design point")
                 continue
             measure(found)
-            # Explained or not, this sample has been followed to where it leads.
-            fails = fails[np.any(fails != left[0], axis=1)]
-        if len(fails[finder.beside(fails)]) or len(finder.points) == most:
+        if len(failing) or len(finder.points) == most:
             doubts.append(f"there may be more than most={most} regions")
         rare = sum(int(np.sum(seen @ p.axis >= 0.5 * p.beta)) <= 1 for p in finder.points)
         if (rare and len(finder.points) > 1) or len(seen) == 0:

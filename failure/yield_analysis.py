@@ -144,7 +144,8 @@ def analyse(
         for k in measured if count >= 3 else []:
             lines[k] = line_sampling(
                 archive.violation(found[k].spec, "line"), 0.0, found[k].design,
-                min_lines=count, max_lines=count, key=jax.random.fold_in(key_lines, k),
+                min_lines=count, max_lines=count, scan=0,
+                key=jax.random.fold_in(key_lines, k),
             )  # fmt: skip
     mixture = mixture_sampling(archive, found, archive.left, n_specs, key=key_mixture)
     specs = [_of_spec(k, found, lines, mixture, config.reach) for k in range(n_specs)]

@@ -9,15 +9,16 @@ is the wanted one, and importance sampling from the same point checks it. `--net
 that only ngspice knows (`examples/`); they have no gradients.
 
 Methods: `lines` (design point, then line sampling), `guided_lines` (values only, differences taken
-again where they matter; trusts that there is one mechanism), `guided_lines_scan` (the same with 100
-wide samples that look for others), `regions` (all regions that can be found, each by lines),
-`ak_is` (importance sampling on a refined Gaussian process), `importance_sampling` from the design
-point, `subset_simulation`; with `+gradient` where gradients are used, each counted as one
-simulation (`sims_factor2`) or as three (`sims_factor2_price3`). `--searches` look for the first
-failure in the ball of 1.1 design distances. A row of record holds simulations to the first failure,
-the share of runs that end within a factor 2 of the truth with a verdict "good" (`success_rate`; of
-searches the share that finds a failure), what they cost, the share of all intervals that hold the
-truth (`coverage`), and the cosine between the design point that was found and a true one. Every
+again where they matter) and `importance_sampling` from the design point trust that there is one
+mechanism; `lines_scan`, `guided_lines_scan` and `importance_sampling_scan`, the functions' default,
+look for others with 100 wide samples. `regions` (all regions that can be found, each by lines),
+`ak_is` (importance sampling on a refined Gaussian process), `subset_simulation`; with `+gradient`
+where gradients are used, each counted as one simulation (`sims_factor2`) or as three
+(`sims_factor2_price3`). `--searches` look for the first failure in the ball of 1.1 design
+distances. A row of record holds simulations to the first failure, the share of runs that end within
+a factor 2 of the truth with a verdict "good" (`success_rate`; of searches the share that finds a
+failure), what they cost, the share of all intervals that hold the truth (`coverage`), and the
+cosine between the design point that was found and a true one. Every
 cell is kept in `--out`, so the command can be killed and repeated. Writes
 `results/table_4_sigma.json`; with `--pictures FOLDER` errors of all runs against their cost, and
 design points by transistor.
@@ -102,15 +103,17 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
     first = cosine = math.nan
     spent = 0
     base = method.removesuffix("+gradient")
+    scan = 100 if base.endswith("_scan") else 0
+    base = base.removesuffix("_scan")
     gradients = 0
     if base == "ak_is":
         ak = ak_sampling(case.performance, case.threshold, case.dim, key=key, slopes=slopes)
         found, first, gradients = ak.estimate, ak.first_failure, ak.n_gradients
         cosine = nearest(case, ak.point)
-    elif base in ("guided_lines", "guided_lines_scan"):
+    elif base == "guided_lines":
         found, point, first = guided_lines(
             case.performance, case.threshold, case.dim, key=key, most=max(400, 4 * case.dim),
-            scan=100 if base == "guided_lines_scan" else 0,
+            scan=scan,
         )  # fmt: skip
         cosine = nearest(case, point)
     elif base == "subset_simulation":
@@ -134,12 +137,13 @@ def one_run(case: Case, method: str, seed: int) -> dict[str, Any]:
         first, cosine = design.first_failure, nearest(case, design.point)
         if base == "lines":
             found = rare_events.line_sampling(
-                case.performance, case.threshold, design, key=key, slopes=slopes
+                case.performance, case.threshold, design, key=key, slopes=slopes, scan=scan
             )
-            gradients += found.n_simulations if slopes else 0
+            # The look at the opposite side and the scan are values.
+            gradients += max(found.n_simulations - 1 - scan, 0) if slopes else 0
         elif design.converged:
             found = rare_events.importance_sampling(
-                case.performance, case.threshold, design.point[None], key=key, n=300
+                case.performance, case.threshold, design.point[None], key=key, n=300, scan=scan
             )
         else:
             found = rare_events.Estimate(math.nan, 0.0, 1.0, 0, 0, 0.0, design.verdict)

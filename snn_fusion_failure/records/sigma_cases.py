@@ -97,7 +97,13 @@ def measured_threshold(performance: Any, slopes: Any, dim: int, p: float) -> dic
     for _ in range(4):
         design = find_design_point(performance, threshold, dim, slopes=slopes)
         found = line_sampling(
-            performance, threshold, design, key=jax.random.key(7), min_lines=30, max_lines=30
+            performance,
+            threshold,
+            design,
+            key=jax.random.key(7),
+            min_lines=30,
+            max_lines=30,
+            scan=0,
         )
         gap = float(norm.isf(p) - norm.isf(found.probability))
         if abs(gap) < 0.01:
@@ -105,10 +111,11 @@ def measured_threshold(performance: Any, slopes: Any, dim: int, p: float) -> dic
         threshold += gap * float(np.linalg.norm(design.gradient))
     design = find_design_point(performance, threshold, dim, slopes=slopes)
     exact = line_sampling(
-        performance, threshold, design, key=jax.random.key(8), min_lines=LINES, max_lines=LINES
-    )
+        performance, threshold, design, key=jax.random.key(8), min_lines=LINES, max_lines=LINES,
+        scan=0,
+    )  # fmt: skip
     check = importance_sampling(
-        performance, threshold, design.point[None], key=jax.random.key(9), n=1500
+        performance, threshold, design.point[None], key=jax.random.key(9), n=1500, scan=0
     )
     return {
         "threshold": threshold, "probability": exact.probability,

@@ -133,7 +133,7 @@ def measured_threshold(
             found.append(
                 line_sampling(
                     term, threshold, designs[-1], key=jax.random.key(7 + k),
-                    min_lines=lines, max_lines=lines,
+                    min_lines=lines, max_lines=lines, scan=0,
                 )
             )  # fmt: skip
         return designs, found
@@ -153,7 +153,7 @@ def measured_threshold(
         threshold += gap * float(np.linalg.norm(nearest.gradient))
     designs, found = measured(threshold, LINES)
     points = np.stack([d.point for d in designs])
-    check = importance_sampling(worst, threshold, points, key=jax.random.key(9), n=WEIGHTED)
+    check = importance_sampling(worst, threshold, points, key=jax.random.key(9), n=WEIGHTED, scan=0)
     verdicts = [f.verdict for f in found if f.verdict != GOOD]
     return {
         "threshold": threshold, "probability": sum(f.probability for f in found),

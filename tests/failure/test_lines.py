@@ -8,8 +8,10 @@ from scipy import stats
 
 from failure.hlrf import find_design_point
 from failure.lines import line_sampling, sample_lines
+from failure.opposite import wide_strangers
 from failure.performances import slopes_by_jax
 from failure.problems import make_problem
+from failure.rare_events import importance_sampling
 from failure.regions import probability_by_lines
 
 DIM = 60
@@ -65,6 +67,41 @@ def test_a_descent_that_stops_elsewhere_says_so_and_gives_no_narrow_interval():
     assert "nominal point fails" in nominal.verdict
 
 
+@pytest.mark.parametrize("name", ["many_regions", "hidden_region"])
+def test_one_region_of_several_is_not_called_good(name):
+    """No opposite side shows these; wide samples do. Both spoke for one region before."""
+    problem = make_problem(name, 1e-9, DIM)
+    slopes = slopes_by_jax(problem.performance)
+    design = find_design_point(problem.performance, problem.threshold, DIM, slopes=slopes)
+    assert design.converged
+    for k in range(5):
+        key = jax.random.key(k)
+        for found in (
+            line_sampling(problem.performance, problem.threshold, design, key=key, slopes=slopes),
+            importance_sampling(
+                problem.performance, problem.threshold, design.point[None], key=key, n=300
+            ),
+        ):
+            assert not found.known and "beside the region" in found.verdict
+            assert found.lower <= problem.probability <= found.upper
+
+
+@pytest.mark.parametrize("name", ["linear", "bent"])
+def test_wide_samples_of_a_single_region_raise_hardly_a_doubt(name):
+    """Seven samples in a hundred fail far beside the axis of a boundary that bends."""
+    problem = make_problem(name, 1e-9, DIM)
+    slopes = slopes_by_jax(problem.performance)
+    design = find_design_point(problem.performance, problem.threshold, DIM, slopes=slopes)
+    region = design.axis[None], np.array([design.beta])
+    seen = [
+        wide_strangers(problem.performance, problem.threshold, *region, 100, key=jax.random.key(k))
+        for k in range(20)
+    ]
+    assert sum(s.strange > 0 for s in seen) <= 2
+    closer = sum(s.n_simulations - 100 for s in seen)
+    assert closer > 0 if name == "bent" else closer == 0
+
+
 def test_lines_cover_the_truth_within_twenty_gradients():
     problem = make_problem("bent", 1e-9, DIM)
     slopes = slopes_by_jax(problem.performance)
@@ -72,8 +109,9 @@ def test_lines_cover_the_truth_within_twenty_gradients():
     inside, cost, within = 0, [], 0
     for k in range(20):
         found = line_sampling(
-            problem.performance, problem.threshold, design, key=jax.random.key(k), slopes=slopes
-        )
+            problem.performance, problem.threshold, design, key=jax.random.key(k), slopes=slopes,
+            scan=0,
+        )  # fmt: skip
         inside += found.lower <= problem.probability <= found.upper
         within += 0.5 <= found.probability / problem.probability <= 2.0
         cost.append(design.n_gradients + found.n_simulations)
@@ -84,7 +122,7 @@ def test_lines_cover_the_truth_within_twenty_gradients():
 def test_lines_with_values_only():
     problem = make_problem("bent", 1e-9, DIM)
     design = find_design_point(problem.performance, problem.threshold, DIM)
-    found = line_sampling(problem.performance, problem.threshold, design, key=KEY)
+    found = line_sampling(problem.performance, problem.threshold, design, key=KEY, scan=0)
     assert found.known and found.lower <= problem.probability <= found.upper
     assert found.n_simulations <= 80
 
@@ -160,6 +198,8 @@ def test_bad_requests():
     design = find_design_point(lambda x: x[:, 0], 3.0, 4)
     with pytest.raises(ValueError, match=r"factor=1\.0"):
         line_sampling(lambda x: x[:, 0], 3.0, design, key=KEY, factor=1.0)
+    with pytest.raises(ValueError, match="scan=-1"):
+        line_sampling(lambda x: x[:, 0], 3.0, design, key=KEY, scan=-1)
     with pytest.raises(ValueError, match="min_lines=2"):
         line_sampling(lambda x: x[:, 0], 3.0, design, key=KEY, min_lines=2)
     with pytest.raises(ValueError, match=r"start.shape=\(3,\)"):

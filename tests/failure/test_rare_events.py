@@ -82,9 +82,13 @@ def test_importance_sampling_interval_covers_the_truth(name):
 def test_importance_sampling_misses_a_region_it_is_not_told_of():
     performance, threshold, truth, points = PROBLEMS["two regions"]
     one = rare_events.importance_sampling(
-        performance, threshold, np.asarray(points[:1]), key=jax.random.key(0)
+        performance, threshold, np.asarray(points[:1]), key=jax.random.key(0), scan=0
     )
     assert one.upper < 0.5 * truth
+    default = rare_events.importance_sampling(
+        performance, threshold, np.asarray(points[:1]), key=jax.random.key(0)
+    )
+    assert not default.known and default.upper >= truth
 
 
 def test_importance_sampling_says_that_the_other_side_of_its_points_fails():
@@ -100,7 +104,7 @@ def test_importance_sampling_says_that_the_other_side_of_its_points_fails():
     assert one.lower <= problem.probability <= one.upper
     both = estimate(problem.points)
     assert both.known and both.lower <= problem.probability <= both.upper
-    assert both.n_simulations == 1002
+    assert both.n_simulations == 1102
 
 
 def test_monte_carlo_interval_covers_the_truth():

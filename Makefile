@@ -7,9 +7,9 @@ NEWER  ?= python3.13
 # The versions that the suite has passed with; `make CONSTRAINTS= test` takes the newest there are.
 CONSTRAINTS ?= constraints.txt
 INSTALL := -m pip install -q --disable-pip-version-check $(if $(CONSTRAINTS),-c $(CONSTRAINTS))
-# Of the slow tests and the documented commands a fifth; which one, the day of the last
+# Of the slow tests and the documented commands an eighth; which one, the day of the last
 # commit says, so that a commit is judged by the same tests whenever that happens. All: PART=0/1.
-PART   ?= $(shell expr $$(git log -1 --format=%ct 2>/dev/null || date +%s) / 86400 % 5)/5
+PART   ?= $(shell expr $$(git log -1 --format=%ct 2>/dev/null || date +%s) / 86400 % 8)/8
 
 # Compiled programs are kept between runs, the small ones too: compiling is most of the time of a
 # short run, and half of it is programs of one operation.
@@ -51,14 +51,14 @@ test: $(VENV)/.dev  ## install what the tests need and run the default suite (<=
 	@$(PYTHON) -m venv .cache/brian2 && { .cache/brian2/bin/pip install -q --disable-pip-version-check \
 	  'numpy<2.3' 'brian2>=2.9' || echo "Brian 2 could not be installed"; }
 
-slow: $(VENV)/.dev .cache/brian2/bin/python  ## a fifth of the long tests, another fifth every day
+slow: $(VENV)/.dev .cache/brian2/bin/python  ## an eighth of the long tests, another every day
 	BRIAN2_PYTHON=$(CURDIR)/.cache/brian2/bin/python \
 	  $(BIN)/python -m pytest -n $(JOBS) --dist loadfile -m slow --slow-part $(PART)
 
 mutate: $(VENV)/.dev  ## break the code in some seventy places, one at a time: tests must notice
 	$(BIN)/python scripts/tools/mutate.py
 
-commands: $(VENV)/.dev  ## run the commands of README and docs (a fifth, another every day) at their smallest size
+commands: $(VENV)/.dev  ## run the commands of README and docs (an eighth, another every day) at their smallest size
 	$(BIN)/python scripts/tools/check_commands.py --jobs $(JOBS) --part $(PART)
 
 lint: $(VENV)/.dev  ## ruff: style and errors

@@ -17,8 +17,9 @@ Networks use the seeds of the tables of record from 0 on. `--choose` trains on s
 training split, one after the other, and drives on maps of the validation split, which says what a
 map is worth as a teacher (`results/study_detour_choice.json`).
 
-The network "S4_way" is compared with the drivers robot by robot (`comparisons`: paired t tests,
-Holm's correction over all of them). Rows go to `results/study_detour.json` as each one ends; one
+The networks "S2_way" and "S4_way" are compared with the drivers, with the networks without
+inhibition and with each other robot by robot (`comparisons`: paired t tests, Holm's correction over
+all of them). Rows go to `results/study_detour.json` as each one ends; one
 that is there already with as many seeds is skipped, so the study can be broken off and gone on
 with. Drivers take seconds, Q-learning two CPU-minutes per row, a network two CPU-seconds per
 seed and row, with `--engine native` one.
@@ -61,8 +62,15 @@ PPO: dict[str, Any] = {
     "initial_std": 0.8,
 }
 PPO_PARAMS = {"learning_rate": 1e-3}
-# The networks against drivers that learn nothing, robot by robot: same seeds, same starts.
-COMPARED = Compared("sr_testing", tuple(("S4_way", driver) for driver in DRIVERS))
+# Robot by robot, same seeds and starts: the networks against drivers that learn nothing, with and
+# without inhibition, and the two rules against each other.
+COMPARED = Compared(
+    "sr_testing",
+    (
+        *((network, driver) for network in ("S2_way", "S4_way") for driver in DRIVERS),
+        *(("S2_way", "S1_way"), ("S4_way", "S3_way"), ("S4_way", "S2_way")),
+    ),
+)
 TITLE = "Drivers and learners on maps that need a detour"
 
 

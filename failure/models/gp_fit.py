@@ -42,10 +42,13 @@ def initial_params(config: GPConfig, dim: int) -> GPParams:
     loc = loc + 0.5 * math.log(dim)
     noise_loc, noise_scale = config.noise_prior
     noise = max(math.exp(noise_loc - noise_scale**2), 2.0 * config.min_noise)
+    # A dtype of their own: a weak one is another type than a fit returns, and would have the fit
+    # compiled a second time when it goes on from its own result.
+    dtype = jnp.result_type(float)
     return GPParams(
-        log_lengthscale=jnp.full((dim,), loc - scale**2),
-        log_noise=jnp.asarray(math.log(noise - config.min_noise)),
-        mean=jnp.zeros(()),
+        log_lengthscale=jnp.full((dim,), loc - scale**2, dtype),
+        log_noise=jnp.asarray(math.log(noise - config.min_noise), dtype),
+        mean=jnp.zeros((), dtype),
     )
 
 

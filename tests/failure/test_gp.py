@@ -183,6 +183,17 @@ def test_one_program_serves_every_count():
         assert np.all(np.isfinite(mean)) and np.all(np.asarray(variance) > 0)
 
 
+def test_a_fit_that_goes_on_from_its_own_result_is_the_same_program():
+    """Weakly typed first parameters had every search compile its fit a second time."""
+    config = gp.GPConfig()
+    x = jax.random.normal(jax.random.key(0), (16, 2))
+    program = jax.jit(partial(gp_fit.fit, config, max_evals=2))
+    args = x, x[:, 0], jnp.asarray(16, jnp.int32)
+    first = program(gp_fit.initial_params(config, 2), *args, jnp.eye(3), jnp.ones((), bool))
+    program(first.params, *args, first.hessian_inverse, jnp.zeros((), bool))
+    assert program._cache_size() == 1
+
+
 def test_standardize_ignores_padding_and_survives_constant_data():
     mask = jnp.asarray([1.0, 1.0, 1.0, 0.0])
     y, mean, sd = gp.standardize(jnp.asarray([1.0, 2.0, 3.0, 99.0]), mask)

@@ -7,6 +7,7 @@ gate misses of it is not there for want of information.
 from __future__ import annotations
 
 import functools
+import warnings
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -84,7 +85,7 @@ def trivial(name: str, dataset: Dataset, noise: Corruption, seed: int) -> dict[s
     Args:
         name: `nearest_rows` looks up the five training rows that are nearest in all sensors, failed
             or not (in their ranks where they are scalars); `linear_fit` is a logistic regression of
-            corrupted rows.
+            corrupted rows, 200 steps of L-BFGS.
         dataset, noise, seed: as in a training of ours; the same test rows.
 
     Raises:
@@ -116,11 +117,15 @@ def trivial(name: str, dataset: Dataset, noise: Corruption, seed: int) -> dict[s
         train, queries = (a.reshape(len(a), -1) for a in (train, queries))
         model = KNeighborsClassifier(5, algorithm="brute").fit(train, dataset.train_y)
     else:
+        from sklearn.exceptions import ConvergenceWarning
         from sklearn.linear_model import LogisticRegression
 
         seen, _ = corrupt(noise.train, jnp.asarray(dataset.train_x), kind, key=train_key)
         train, queries = (np.asarray(a).reshape(len(a), -1) for a in (seen, queries))
-        model = LogisticRegression(max_iter=200).fit(train, dataset.train_y)
+        with warnings.catch_warnings():
+            # The last steps of a fit to windows change nothing that counts here.
+            warnings.simplefilter("ignore", ConvergenceWarning)
+            model = LogisticRegression(max_iter=200).fit(train, dataset.train_y)
     found = split_accuracy(labels, model.predict(queries), mask)
     scores = {"": found.overall, "_clean": found.clean, "_corrupted": found.corrupted}
     # A clean row of a table has no corrupted part.

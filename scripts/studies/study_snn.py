@@ -78,7 +78,9 @@ STUDIES: dict[str, dict[str, tuple[str, tuple[str, ...]]]] = {
         ),
         "guided (rule of all sonars)": ("guided", ()),
         "way, rewards by the nearest obstacle": ("way", ("config.guidance=nearest",)),
+        "way, rewarded after the move": ("way", ("config.reward_timing=after",)),
         "tuned": ("tuned", ()),
+        "literal": ("literal", ()),
     },
     # The reward's end of step by its potential and by a critic's error, beside the trainer's reward
     # and in its place.

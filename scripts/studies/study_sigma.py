@@ -15,11 +15,15 @@ look for others with 100 wide samples. `regions` (all regions that can be found,
 `ak_is` (importance sampling on a refined Gaussian process), `subset_simulation`; with `+gradient`
 where gradients are used, each counted as one simulation (`sims_factor2`) or as three
 (`sims_factor2_price3`). `--searches` look for the first failure in the ball of 1.1 design
-distances. A row of record holds simulations to the first failure, the share of runs that end within
-a factor 2 of the truth with a verdict "good" (`success_rate`; of searches the share that finds a
-failure), what they cost, the share of all intervals that hold the truth (`coverage`), and the
-cosine between the design point that was found and a true one. Every
-cell is kept in `--out`, so the command can be killed and repeated. Writes
+distances. A row of record holds the share of runs that end within a factor 2 of the truth with a
+verdict "good" (`success_rate`; of searches the share that finds a failure), what they cost, the
+share of all intervals that hold the truth (`coverage`), and the cosine between the design point
+that was found and a true one. `first_failure` is the number of simulations to the first failing
+one, over the runs that have one; `first_failure_share` says how many those are. A search counts
+failures within its ball; an estimator counts one wherever it lies, `lines` and
+`importance_sampling` on the way to the design point only, `regions` and `subset_simulation` none.
+A truth that was measured has its 95 % interval beside it (`truth_interval`). Every cell is kept in
+`--out`, so the command can be killed and repeated. Writes
 `results/table_4_sigma.json`; with `--pictures FOLDER` errors of all runs against their cost, and
 design points by transistor.
 """
@@ -47,6 +51,9 @@ from snn_fusion_failure.runs import (
     repository,
 )
 from snn_fusion_failure.runs.command import run_command
+
+UNCOUNTED = ("regions", "subset_simulation")
+"""Methods that do not count their simulations to the first failing one."""
 
 
 @dataclass(frozen=True)
@@ -169,6 +176,7 @@ def rows_of(case: Case, method: str, runs: list[dict[str, Any]]) -> list[dict[st
         return math.nan if value is None else float(value)
 
     base = {"row": case.row, "model": method, "truth": case.truth, "threshold": case.threshold}
+    base |= case.measured
     inside = [number(r["lower"]) <= case.truth <= number(r["upper"]) for r in runs]
     near = [
         r["verdict"] == "good" and 0.5 <= number(r["probability"]) / case.truth <= 2.0 for r in runs
@@ -190,6 +198,10 @@ def rows_of(case: Case, method: str, runs: list[dict[str, Any]]) -> list[dict[st
         {**base, "metric": "simulations", "unit": "simulations",
          **summarize([float(r["simulations"]) for r in runs])},
     ]  # fmt: skip
+    if method.removesuffix("+gradient") not in UNCOUNTED:
+        rows.append(
+            {**base, "metric": "first_failure_share", "unit": "1", "n": n, "mean": len(first) / n}
+        )
     for metric, unit, values in (
         ("sims_factor2", "simulations", cost),
         ("sims_factor2_price3", "simulations", dear if method.endswith("+gradient") else []),
@@ -274,6 +286,7 @@ def other_rows(config: Config, case: Case) -> list[dict[str, Any]]:
             ),
         )  # fmt: skip
         rows += rows_of_search(case.row, name, case.truth, case.threshold, runs)
+    rows = [row | case.measured for row in rows]
     title = "Failures at fixed probability"
     record_table(config.record, "4.sigma", title, rows, preset="paper", whole_cells=True)
     return rows

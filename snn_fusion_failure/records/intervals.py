@@ -10,8 +10,11 @@ from typing import Any
 SHARES = re.compile(
     r"sr_|success_rate|accuracy|average_precision|(?:2d|3d|bev)_\w+_r\d+|share_|collided"
     r"|gate_auroc|weight_auroc|mean_retained|(?:first|second)_stage$|(?:image|camera|lidar)$"
+    r"|coverage$|known$|first_failure_share$"
 )
-"""Scores that are shares: of trials, of examples, of pairs (an AUROC)."""
+"""Scores that are shares: of trials, of examples, of pairs (an AUROC), of runs."""
+COUNTS = re.compile(r"(?:success_rate|coverage|known|first_failure_share)$")
+"""Shares of independent runs that did something or not, kept as one number and `n`."""
 SUCCESSES = re.compile(r"sr_|success_rate")
 """Shares of trials that end in success or not; each run has at least one."""
 
@@ -114,7 +117,7 @@ def interval(row: Mapping[str, Any]) -> tuple[float, float] | None:
     if top is not None and len(values) > 1:
         successes = bool(SUCCESSES.match(row["metric"]))
         return share_interval(values, top, successes=successes)
-    single = row.get("metric") == "success_rate" and held is None and row.get("n", 0) > 1
+    single = COUNTS.match(str(row.get("metric", ""))) and held is None and row.get("n", 0) > 1
     if top is not None and single and row.get("mean") is not None:
         low, high = wilson(row["mean"] / top, row["n"])
         return top * low, top * high

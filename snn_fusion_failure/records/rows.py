@@ -116,9 +116,10 @@ def record_table(
 
     Every row keeps the command and the commit that made it. What is `compared` is worked out from
     all rows of the table, those of earlier commands too. The interval of a share is one that stays
-    within 0 and 100 %. Numbers of code that was changed and not committed are refused in
-    `results/`, and kept under `runs/refused/` instead, unless `SFF_ALLOW_DIRTY=1` is set; their
-    `git` field ends in `-dirty`.
+    within 0 and 100 %; earlier rows that lack one get it, from their own mean and `n`.
+
+    Numbers of code that was changed and not committed are refused in `results/`, and kept under
+    `runs/refused/` instead, unless `SFF_ALLOW_DIRTY=1` is set; their `git` field ends in `-dirty`.
 
     Raises:
         ValueError: the rows belong into `results/`, and nobody could say which code made them.
@@ -139,7 +140,11 @@ def record_table(
 
     parts = 2 if whole_cells else 3
     new = {key(row)[:parts] for row in rows}
-    kept = [row for row in recorded(path) if key(row)[:parts] not in new]
+    kept = [
+        row if row.get("ci95") else {**row, **_ends(row)}
+        for row in recorded(path)
+        if key(row)[:parts] not in new
+    ]
     held = {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows}
     comparisons = compare_columns(held["rows"], compared)
     write_json(path, held | ({"comparisons": comparisons} if comparisons else {}))

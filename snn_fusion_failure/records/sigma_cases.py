@@ -36,6 +36,13 @@ class Case(NamedTuple):
     truth: float
     points: Any
     batched: Callable[[Any], Any]
+    truth_interval: tuple[float, float] | None = None
+    """95 % interval of a truth that was measured; None where it is known exactly."""
+
+    @property
+    def measured(self) -> dict[str, Any]:
+        """`truth_interval` for a row of record, nothing where the truth is exact."""
+        return {} if self.truth_interval is None else {"truth_interval": [*self.truth_interval]}
 
 
 def problem_case(name: str, p: float, dim: int) -> Case:
@@ -72,6 +79,7 @@ def circuit_case(name: str, p: float, folder: Path) -> Case:
     return Case(
         f"{name} P={p:.0e}", performance, slopes, target["threshold"], circuit.n_dims,
         target["probability"], np.asarray(target["point"])[None], performance,
+        tuple(target["interval"]),
     )  # fmt: skip
 
 

@@ -93,6 +93,7 @@ def netlist_case(name: str, p: float, folder: Path) -> Case:
     return Case(
         f"{name} P={p:.0e}", performance, None, target["threshold"], dim,
         target["probability"], np.asarray(target["points"]), performance,
+        tuple(target["interval"]),
     )  # fmt: skip
 
 

@@ -226,6 +226,20 @@ def test_result_line_and_failure(capsys: pytest.CaptureFixture[str]) -> None:
     assert capsys.readouterr().err == "error: n_clean=9\n"
 
 
+def test_earlier_shares_get_the_interval_that_they_lack(tmp_path: Path) -> None:
+    """Wilson's 95 % interval of 20 of 20, by hand: 1 / (1 + 1.96^2 / 20) = 0.839."""
+    path = tmp_path / "t.json"
+    old = {"row": "a", "model": "m", "unit": "1", "n": 20, "mean": 1.0, "git": "1234567"}
+    held = [old | {"metric": name} for name in ("coverage", "known", "coverage_90")]
+    held.append(old | {"metric": "success_rate", "ci95": [0.5, 1.0]})
+    write_json(path, {"rows": held})
+    record_table(path, "4", "T", [old | {"metric": "first_failure_share"}], preset="paper")
+    rows = {r["metric"]: r for r in recorded(path)}
+    for name in ("coverage", "known", "first_failure_share"):
+        assert rows[name].pop("ci95") == pytest.approx([0.839, 1.0], abs=5e-4)
+    assert [rows[r["metric"]] for r in held] == held
+
+
 def test_a_metric_that_a_cell_has_no_longer_goes_with_whole_cells(tmp_path: Path) -> None:
     """What ten successful runs cost stayed in the table after none succeeded any more."""
     path = tmp_path / "t.json"

@@ -58,7 +58,7 @@ def run_phases(
     each = (
         jnp.arange(len(n_trials)) == 0,
         jnp.asarray(plastic),
-        jnp.asarray(n_trials),
+        jnp.asarray(n_trials, jnp.int32),
         jnp.swapaxes(keys, 0, 1),
         given,
     )

@@ -259,7 +259,8 @@ def run_phase(
             poses=poses,
         )
 
-    last = n_trials if run is None else run
+    # Trials are counted in int32; under `jax.enable_x64` a traced `run` may be wider.
+    last = n_trials if run is None else jnp.asarray(run, jnp.int32)
     advance = functools.partial(_advance, agent, last, max_steps)
     many = jax.vmap(advance, in_axes=(params_axis, map_axis, 0, 0))
     starts, result = jax.vmap(begin, in_axes=(0, map_axis))(keys, map)

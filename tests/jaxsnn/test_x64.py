@@ -11,8 +11,11 @@ import numpy as np
 import pytest
 
 from jaxsnn import LIFParams, STDPParams, lif_init, lif_scan, preset, scenario, snn_params
+from jaxsnn.drivers import DRIVERS, driver_agent
 from jaxsnn.experiment import run_experiment
 from jaxsnn.plasticity import stdp_init
+from jaxsnn.trials import run_phase
+from jaxsnn.ways import with_way
 from jaxsnn.window import stdp_kernel, stdp_steps, stdp_window
 
 SMALL = {"group_exc": 2, "group_inh": 2, "hidden_exc": 8, "hidden_inh": 8,
@@ -39,6 +42,37 @@ def test_scans_keep_the_dtype_of_their_state(double: bool) -> None:
         fast, same = stdp_window(kernel, stdp_init(4, 3), pre, fired.astype(want))
         assert slow.z.dtype == fast.z.dtype == total.dtype == want
         np.testing.assert_allclose(same, total, rtol=1e-12 if double else 1e-4, atol=1e-9)
+
+
+@pytest.mark.parametrize("reading", ["literal", "guided", "way"])
+@pytest.mark.relaxed
+def test_an_experiment_can_be_traced_in_double_precision(reading: str) -> None:
+    """Loops refuse a carry that changes its dtype; this takes no compiling."""
+    config, params = preset("S4", reading, config=SMALL)
+    with precision(True):
+        out = jax.eval_shape(
+            lambda keys: run_experiment(
+                config, snn_params(config, params), with_way(scenario(1)), keys=keys,
+                n_learn=2, n_test=1, max_steps=3, block=1, keep_states=True,
+            ),
+            jax.random.split(jax.random.key(0), 2),
+        )  # fmt: skip
+    assert out.states.weights.hidden.dtype == jnp.float64
+    assert out.testing.steps.dtype == jnp.int32
+
+
+@pytest.mark.relaxed
+def test_a_phase_takes_a_number_of_trials_of_any_width() -> None:
+    with precision(True):
+        keys = jax.random.split(jax.random.key(0), 1)
+        _, out = jax.eval_shape(
+            lambda run: run_phase(
+                driver_agent(), DRIVERS["blind"], scenario(1), jnp.zeros(1),
+                keys=keys, n_trials=2, max_steps=3, run=run,
+            ),
+            jnp.asarray(1, jnp.int64),
+        )  # fmt: skip
+    assert out.steps.dtype == jnp.int32
 
 
 @pytest.mark.slow

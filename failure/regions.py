@@ -49,18 +49,21 @@ class _Finder:
         )  # fmt: skip
         self.points: list[DesignPoint] = []
         self.values = self.gradients = 0
-        self.failed = ""
+        self.failed = False
 
     def find(self, start: np.ndarray | None, *, restarts: int = 0) -> DesignPoint | None:
-        """A design point of a region that is not known yet, or None."""
+        """A design point of a region that is not known yet, or None.
+
+        None is a descent that `failed`, or one that led to a known region or too far out to count.
+        """
         found = find_design_point(
             self.performance, self.threshold, self.dim, slopes=self.slopes, start=start,
             restarts=restarts,
         )  # fmt: skip
         self.values += found.n_simulations
         self.gradients += found.n_gradients
-        if not found.converged:
-            self.failed = found.verdict
+        self.failed = not found.converged
+        if self.failed:
             return None if self.points else found
         new = not any(self._alike(found.point, p.point) for p in self.points)
         near = not self.points or found.beta < self.points[0].beta + FURTHER
@@ -173,16 +176,21 @@ def probability_by_lines(
             x = wide * np.asarray(jax.random.normal(keys[-1], (scan, dim)))
         seen = failing = x[fails(counted, threshold, x)]
         tried = 0
+        # Where a first sample beside a region leads back to it, it is the region that bends. Before
+        # that a way that fails is no sign that a sample is explained: a saddle has it, too.
+        bends = False
         while len(failing := failing[beside(failing, *finder.known)]) and tried < most:
             one, failing = failing[0], failing[1:]
-            if explained(counted, threshold, one, *finder.known):
+            if bends and explained(counted, threshold, one, *finder.known):
                 continue
             tried += 1
-            inner = onto_boundary(counted, float(threshold), one)
-            if (found := finder.find(inner)) is None or not found.converged:
+            found = finder.find(onto_boundary(counted, float(threshold), one))
+            if found is not None:
+                measure(found)
+            elif finder.failed:
                 doubts.append("a wide sample fails beside all regions and leads to no design point")
-                continue
-            measure(found)
+            else:
+                bends = True
         if len(failing) or len(finder.points) == most:
             doubts.append(f"there may be more than most={most} regions")
         rare = sum(int(np.sum(seen @ p.axis >= 0.5 * p.beta)) <= 1 for p in finder.points)

@@ -194,6 +194,30 @@ def test_failures_on_a_whole_circle_are_not_called_known():
         assert not found.estimate.known and found.estimate.upper == 1.0
 
 
+def test_a_boundary_that_bends_is_one_region_and_known():
+    """Wide samples beside it lead back to it; that was taken for no design point at all."""
+    problem = make_problem("bent", 1e-9, DIM)
+    for k in range(3):
+        found = probability_by_lines(
+            problem.performance, problem.threshold, DIM, key=jax.random.key(k),
+            slopes=slopes_by_jax(problem.performance),
+        )  # fmt: skip
+        assert found.estimate.known and len(found.points) == 1
+        assert found.estimate.lower <= problem.probability <= found.estimate.upper
+        assert found.estimate.n_simulations < 350
+
+
+@pytest.mark.parametrize("name", ["curved_manifold", "shell"])
+def test_regions_by_values_are_not_good_and_wrong(name):
+    """The way from a wide sample to the heart of a saddle, or around a circle, fails as well."""
+    problem = make_problem(name, 1e-9, DIM)
+    for k in (9, 15):
+        found = probability_by_lines(
+            problem.performance, problem.threshold, DIM, key=jax.random.key(k)
+        ).estimate
+        assert not found.known or found.lower <= problem.probability <= found.upper
+
+
 def test_bad_requests():
     design = find_design_point(lambda x: x[:, 0], 3.0, 4)
     with pytest.raises(ValueError, match=r"factor=1\.0"):

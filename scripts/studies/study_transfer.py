@@ -2,11 +2,12 @@
 
     python scripts/studies/study_transfer.py --study maps --model S4 --seeds 32
     python scripts/studies/study_transfer.py --study trials --model S4 --seeds 32
+    python scripts/studies/study_transfer.py --study trials --reading way --scenarios D1 D2 D3
 
-`maps`: robots learn for 20 trials on Scenario 1, 2 or 3 and drive, weights frozen, one trial on
-each of 100 random solvable maps that nothing was tuned on (`jaxsnn.random_map`, a key of its
-own). Rows go to `results/study_snn_maps.json`: success rate per robot over the maps, per map over
-the robots, and path against the shortest one.
+`maps`: robots learn for 20 trials on a scenario or its detour reading and drive, weights frozen,
+one trial on each of 100 random solvable maps that nothing was tuned on (`jaxsnn.random_map`, a key
+of its own). Rows go to `results/study_snn_maps.json`: success rate per robot over the maps, per
+map over the robots, and path against the shortest one.
 
 `trials`: robots learn for 1, 2, 3, 5, 10, 20, 40 trials and are then tested, weights frozen. Rows
 go to `results/study_snn_trials.json`, with the first of these numbers after which at least 90 % of
@@ -22,6 +23,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from snn_fusion_failure.records.detour_rows import train_map
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
@@ -43,8 +45,10 @@ class Transfer:
     study: Literal["maps", "trials"] = "maps"
     model: Annotated[Literal["S1", "S2", "S3", "S4"], arg(aliases=["--network"])] = "S4"
     reading: Annotated[str, arg(aliases=["--setting"])] = "tuned"
-    scenarios: tuple[int, ...] = (1, 2, 3)
-    """Maps to learn on."""
+    scenarios: tuple[str, ...] = ("1", "2", "3")
+    """Maps to learn on: 1 to 3, or D1 to D3 for their detour readings."""
+    engine: Literal["xla", "native"] = "xla"
+    """What computes the network's windows; native is faster (`jaxsnn.native`)."""
     seeds: int = 32
     maps: int = 100
     """Unseen maps."""
@@ -58,19 +62,35 @@ class Transfer:
     """Write the rows into results/."""
 
 
-def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
+def _row(scenario: str) -> str:
+    return scenario if scenario.startswith("D") else f"Scenario {scenario}"
+
+
+def _training_map(network: Any, scenario: str) -> Any:
+    from jaxsnn import ways
+
+    map = train_map(_row(scenario))
+    return ways.with_way(map) if network.guidance == "way" else map
+
+
+def _network(config: Transfer) -> tuple[Any, Any]:
+    from jaxsnn.presets import preset
+
+    return preset(config.model, config.reading, config={"engine": config.engine})
+
+
+def study_maps(config: Transfer, scenario: str) -> dict[str, list[float]]:
     """Percent of unseen maps solved by each robot, of robots that solve each map, path ratios."""
     import jax
     import jax.numpy as jnp
     import numpy as np
 
-    from jaxsnn import agents, maps, planner, random_maps, scenarios, trials
+    from jaxsnn import agents, maps, planner, random_maps, trials
     from jaxsnn.experiment import learning_circles, phase_keys, run_experiment, seed_keys
-    from jaxsnn.presets import preset
     from jaxsnn.status import Status
 
-    built, constants = preset(config.model, config.reading)
-    map = scenarios.scenario(scenario)
+    built, constants = _network(config)
+    map, number = _training_map(built, scenario), int(scenario[-1])
     root = jax.random.key(MAP_KEY)
     unseen = [random_maps.random_map(key=jax.random.fold_in(root, i)) for i in range(config.maps)]
     stacked = maps.stack_maps(unseen)
@@ -82,7 +102,7 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     def learn(keys: Any, params: Any) -> Any:
         return run_experiment(
             built, params, map, keys=keys, n_learn=20, n_test=1, max_steps=config.max_steps,
-            block=config.block, circles=learning_circles(scenario, 20), keep_states=True,
+            block=config.block, circles=learning_circles(number, 20), keep_states=True,
         ).states  # fmt: skip
 
     def test_keys(keys: Any, i: Any) -> Any:
@@ -121,19 +141,18 @@ def study_maps(config: Transfer, scenario: int) -> dict[str, list[float]]:
     }
 
 
-def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
+def study_trials(config: Transfer, scenario: str) -> dict[str, list[float]]:
     """SR-testing after so many learning trials, and the first number with at least 90 %."""
     import jax
     import jax.numpy as jnp
     import numpy as np
 
-    from jaxsnn import agents, scenarios
+    from jaxsnn import agents
     from jaxsnn.experiment import learning_circles, run_experiment, seed_keys
-    from jaxsnn.presets import preset
     from jaxsnn.status import Status
 
-    built, constants = preset(config.model, config.reading)
-    map = scenarios.scenario(scenario)
+    built, constants = _network(config)
+    map, number = _training_map(built, scenario), int(scenario[-1])
     params = jax.tree.map(jnp.float32, agents.snn_params(built, constants))
     keys = seed_keys(jnp.arange(config.seeds))
     values: dict[str, list[float]] = {}
@@ -144,7 +163,7 @@ def study_trials(config: Transfer, scenario: int) -> dict[str, list[float]]:
             lambda keys, params, n=n: run_experiment(
                 built, params, map, keys=keys, n_learn=n, n_test=config.test_trials,
                 max_steps=config.max_steps, block=config.block,
-                circles=learning_circles(scenario, n),
+                circles=learning_circles(number, n),
             ).testing.status
         )  # fmt: skip
         column = (np.asarray(run(keys, params)) == Status.ARRIVED).mean(axis=1)
@@ -169,7 +188,7 @@ def shown_metric(config: Transfer) -> str:
     return f"sr_testing_after_{20 if 20 in config.checkpoints else config.checkpoints[-1]}"
 
 
-def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
+def main(config: Transfer) -> dict[str, dict[str, list[float]]]:
     """Run the study on every scenario; returns the values by scenario."""
     if config.seeds < 1 or config.maps < 1:
         raise ValueError(f"seeds={config.seeds}, maps={config.maps}: expected at least 1; raise it")
@@ -177,6 +196,9 @@ def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
         raise ValueError(
             f"checkpoints={config.checkpoints}: expected rising numbers from 1 on; reorder them"
         )
+    known = [f"{kind}{n}" for kind in ("", "D") for n in (1, 2, 3)]
+    if unknown := [s for s in config.scenarios if s not in known]:
+        raise ValueError(f"scenarios={unknown}: expected some of {', '.join(known)}; choose")
     enable_compilation_cache()
     run = study_maps if config.study == "maps" else study_trials
     found: dict[Any, Any] = {}
@@ -187,14 +209,14 @@ def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
             found[scenario] = values
             name = shown_metric(config)
             mean = sum(values[name]) / len(values[name])
-            bar.update(task, advance=1, status=f"Scenario {scenario}: {mean:.0f} %")
+            bar.update(task, advance=1, status=f"{_row(scenario)}: {mean:.0f} %")
             if not config.record:
                 continue
             model: str = config.model
             if config.reading != "tuned":
                 model += f" {config.reading}"
             rows = [
-                {"row": f"trained on Scenario {scenario}", "model": model, "metric": metric,
+                {"row": f"trained on {_row(scenario)}", "model": model, "metric": metric,
                  "unit": UNITS.get(metric, "%"), **summarize(v)}
                 for metric, v in values.items() if v
             ]  # fmt: skip
@@ -209,7 +231,7 @@ def main(config: Transfer) -> dict[int, dict[str, list[float]]]:
     return found
 
 
-def fields(config: Transfer, found: dict[int, dict[str, list[float]]]) -> dict[str, Any]:
+def fields(config: Transfer, found: dict[str, dict[str, list[float]]]) -> dict[str, Any]:
     """What the result line says."""
     name = shown_metric(config)
     rates = {f"scenario{s}": sum(v[name]) / len(v[name]) for s, v in found.items()}

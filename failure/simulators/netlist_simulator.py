@@ -6,6 +6,7 @@ import hashlib
 import shlex
 import shutil
 import tempfile
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -32,7 +33,7 @@ _MEASURE_FILES = ("*.mt*", "*.ms*", "*.ma*")
 """Where simulators other than ngspice put their measures."""
 
 _KEPT = 200
-"""Decks and logs of odd runs that are kept at most."""
+"""Decks and logs that are kept at most of each kind, so that failures leave room for odd runs."""
 
 
 @dataclass
@@ -42,7 +43,8 @@ class NetlistSimulator:
     A violation (`failure.simulators.measures.violation`) is above 0 where the specification fails
     in one of the corners. Every run has a folder of its own, is ended after `timeout` seconds and
     cached by the text of its deck, so that other limits, more corners or another budget pay for
-    nothing twice. Deck and log of every run that misses a measure are kept in `keep`.
+    nothing twice. Deck and log of every run that misses a measure (`odd_*`) or has one beyond its
+    limit (`fail_*`) are kept in `keep`, 200 of each at most.
 
     Attributes:
         deck: the netlist.
@@ -98,7 +100,7 @@ class NetlistSimulator:
                 f"command={program!r}: expected a program on PATH; there is none{advice}"
             )
         self._nominal: np.ndarray | None = None
-        self._kept = 0
+        self._kept: Counter[str] = Counter()
         self._from_cache = 0
         self._batch = Batch(
             len(self.names), self.workers, self.retries, self.timeout, None, True, "", 0
@@ -204,9 +206,9 @@ class NetlistSimulator:
 
     def keep_run(self, text: str, log: str, label: str) -> Path | None:
         """Keep deck and log of a run; None where nothing is kept (any more)."""
-        if self.keep is None or self._kept >= _KEPT:
+        if self.keep is None or self._kept[label] >= _KEPT:
             return None
-        self._kept += 1
+        self._kept[label] += 1
         self.keep.mkdir(parents=True, exist_ok=True)
         path = self.keep / f"{label}_{self.identity(text)[:12]}.cir"
         path.write_text(text, encoding="utf-8")
@@ -239,10 +241,11 @@ class _Run:
                 return self._read(stored["numbers"], str(stored["trouble"]), Status.FAILED)
         numbers, log, status = self._simulate(text, timeout)
         trouble = printed_trouble(log)
-        missing = [n for n in owner.names if n not in numbers]
-        if missing:
+        if not all(np.isfinite(numbers.get(n, np.nan)) for n in owner.names):
             kept = owner.keep_run(text, log, "odd")
             trouble += f" (deck and log: {kept})" if kept else ""
+        elif not all(lim.low <= numbers[lim.name] <= lim.high for lim in owner.limits):
+            owner.keep_run(text, log, "fail")
         # Out of time is not what the deck is: another limit may let it end.
         if path is not None and status != Status.TIMED_OUT:
             save_record(path, {"numbers": numbers, "trouble": trouble})

@@ -5,7 +5,8 @@
 Checks what the wheel holds, that importing is quiet, that the links of its long description are
 absolute, and that the commands work where there is no repository: a sweep of a study in the current
 directory, from the shell and from Python; a training; a search for failures of a two-line
-simulator; `--record` refused. The environment shares the libraries of the running Python
+simulator; where ngspice is installed, one of a netlist of `examples/`; `--help` of all commands;
+`--record` refused. The environment shares the libraries of the running Python
 (`--full` installs them all from the registry). Two to three minutes.
 """
 
@@ -13,6 +14,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
+import shutil
 import subprocess
 import sys
 import sysconfig
@@ -20,6 +22,7 @@ import tempfile
 import zipfile
 from pathlib import Path
 
+from snn_fusion_failure.cli import COMMANDS
 from snn_fusion_failure.runs import print_result, repository, run_command
 
 PACKAGES = ("jaxsnn", "fusion", "failure", "snn_fusion_failure")
@@ -117,8 +120,32 @@ def run(command: list[str], folder: Path, *, status: int = 0) -> str:
     return done.stdout + done.stderr
 
 
+def check_help(sff: str, folder: Path) -> int:
+    """Every command is listed and explains itself; returns how many commands ran."""
+    listed = run([sff], folder)
+    for name in COMMANDS:
+        if f"  {name} " not in listed:
+            raise ValueError(f"sff: expected {name!r} in its list\n{listed}")
+        found = run([sff, name, "--help"], folder)
+        if f"usage: sff {name}" not in found:
+            raise ValueError(f"sff {name} --help: expected its usage in\n{found}")
+    return 1 + len(COMMANDS)
+
+
+def netlist_commands(sff: str, folder: Path) -> list[tuple[list[str], str]]:
+    """A search in one of the netlists, which are copied to `folder`; none without ngspice."""
+    for file in (repository.ROOT / "examples").glob("*.cir"):
+        shutil.copy(file, folder)
+    if shutil.which("ngspice") is None:
+        print("== ngspice is not installed: the search in a netlist is left out", flush=True)
+        return []
+    options = ["--netlist", "sram_cell.cir", "--vary", "pu1:20m", "pd1:20m", "ax1:20m"]
+    options += ["--measure", "snm1>=130", "--n-total", "30", "--out", "runs/cell"]
+    return [([sff, "find-failures", *options], "worst_distance=6.2")]
+
+
 def check_commands(programs: Path, folder: Path) -> int:
-    """A user's own study, simulator and training; returns how many commands ran."""
+    """A user's own study, simulator, netlist and training; returns how many commands ran."""
     work = folder / "work"
     (work / "scripts").mkdir(parents=True)
     (work / "scripts" / "__init__.py").write_text("raise RuntimeError('not ours')\n")
@@ -135,6 +162,7 @@ def check_commands(programs: Path, folder: Path) -> int:
         ([sff, "train-argate", "--dataset", "simulated", "--preset", "quick"], "result: "),
         ([sff, "find-failures", "--circuit", "my_simulator:simulate", "--dimensions", "2",
           "--spec", "value", "--preset", "quick", "--threshold=-1"], "success=1"),
+        *netlist_commands(sff, work),
     ]  # fmt: skip
     for command, wanted in commands:
         print("==", " ".join(Path(c).name if c == command[0] else c for c in command), flush=True)
@@ -144,7 +172,7 @@ def check_commands(programs: Path, folder: Path) -> int:
     refused = run([sff, "train-snn", "--record"], work, status=2)
     if "expected a checkout" not in refused:
         raise ValueError(f"--record was not refused with its reason:\n{refused}")
-    return len(commands) + 1
+    return len(commands) + 1 + check_help(sff, work)
 
 
 def main(config: Config) -> dict[str, int]:

@@ -6,8 +6,9 @@ Every `--vary NAME:SIGMA` is a `.param` of the netlist that is normal about its 
 absolute (2m) or a relative (1%) sigma; every `--measure` a limit on what `.meas` or `print` gives.
 The tool starts the simulator itself, `--workers` at a time, and writes to DIR: `report.html`,
 `specs.csv`, `parameters.csv`, `corners.csv`, `samples.csv`, `result.json`, the deck of each worst
-case (`worst_*.cir`), and in `kept/` deck and log of runs that missed a measure. Finished runs are
-in `DIR/cache`: `--resume` pays for nothing twice, with a larger `--n-total` too.
+case (`worst_*.cir`), and in `kept/` deck and log of runs that missed a measure (`odd_*`) or failed
+(`fail_*`). Finished runs are in `DIR/cache`: `--resume` pays for nothing twice, with a larger
+`--n-total` too.
 """
 
 from __future__ import annotations

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from failure.simulators import SimulatorError
+from failure.simulators import SimulatorError, netlist_simulator
 from failure.simulators.corners import Corner, pvt_corners
 from failure.simulators.deck import parse_deck, read_deck
 from failure.simulators.measures import parse_limit, violation
@@ -222,6 +222,45 @@ def test_a_missing_measure_is_what_it_was_said_to_be(command, tmp_path: Path) ->
     assert "no number for other; printed: out" in ignoring.messages[1, "nominal"]
     with pytest.raises(SimulatorError, match="sample 1, corner nominal: no number for other"):
         simulator(command[0], invalid="stop")(x)
+
+
+def test_failing_runs_are_kept_and_leave_room_for_odd_ones(
+    command, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Out is 1000 / (r1 + 1000): beyond 0.6 below r1 = 667, missing above r1 = 1200."""
+    monkeypatch.setattr(netlist_simulator, "_KEPT", 2)
+    x = np.array([[0.0, 0.0], [-35.0, 0.0], [-40.0, 0.0], [-45.0, 0.0], [25.0, 0.0], [-30.0, 0.0]])
+    g, _ = simulator(command[0], keep=tmp_path / "kept")(x)
+    assert (g[:, 0] > 0).tolist() == [False, True, True, True, True, False]
+    decks = {label: sorted((tmp_path / "kept").glob(f"{label}_*.cir")) for label in ("fail", "odd")}
+    assert [len(found) for found in decks.values()] == [2, 1]
+    assert [".param r1=650" in p.read_text() or ".param r1=600" in p.read_text()
+            for p in decks["fail"]] == [True, True]  # fmt: skip
+    assert all("OUT = 6." in p.with_suffix(".log").read_text() for p in decks["fail"])
+
+
+def test_an_infinite_measure_is_kept_as_odd(tmp_path: Path) -> None:
+    text = f"{sys.executable} -I -S -c 'print(\"out = 0.5\\nother = inf\")' {{deck}}"
+    simulate = simulator(text, keep=tmp_path / "kept", invalid="ignore")
+    values, _ = simulate.measure(np.zeros((1, 2)))
+    assert values[0, 0].tolist() == [0.5, np.inf]
+    assert [p.name[:4] for p in (tmp_path / "kept").glob("*.cir")] == ["odd_"]
+
+
+def test_measures_are_read_from_a_file_beside_the_deck(tmp_path: Path) -> None:
+    """Xyce prints them to `deck.cir.mt0`, and to the screen under headings only."""
+    program = tmp_path / "xyce.py"
+    program.write_text(
+        "import re, sys\n"
+        "r1, r2 = re.findall(r'r\\d=([-+.e\\d]+)', open(sys.argv[1]).read())\n"
+        "out = float(r2) / (float(r1) + float(r2))\n"
+        "open(sys.argv[1] + '.mt0', 'w').write(f'OUT = {out:.9e}\\nOTHER = 1.0\\n')\n"
+        "print('***** Beginning Transient Analysis')\n"
+    )
+    simulate = simulator(f"{sys.executable} -I -S {program} {{deck}}")
+    values, status = simulate.measure(np.array([[-10.0, 0.0], [0.0, 10.0]]))
+    np.testing.assert_allclose(values[:, 0], [[1000 / 1900, 1.0], [1100 / 2100, 1.0]], rtol=1e-8)
+    assert status.tolist() == [[Status.GOOD], [Status.GOOD]]
 
 
 def test_runs_are_paid_for_once_whatever_the_limits(command, tmp_path: Path) -> None:

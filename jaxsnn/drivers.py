@@ -13,10 +13,12 @@ from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
-from jaxtyping import Array, Bool, Float, Key
+from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxsnn import world
+from jaxsnn._checks import concrete, require, require_keys
 from jaxsnn.agents import Agent
+from jaxsnn.status import Status
 from jaxsnn.trials import TrialResult, run_phase
 
 
@@ -127,3 +129,67 @@ def drive(
     return drive_fixed(
         driver_agent(), params, map, keys=keys, n_trials=n_trials, max_steps=max_steps
     )
+
+
+def drive_together(
+    params: DriverParams,
+    map: world.WorldParams,
+    *,
+    keys: Key[Array, " runs"],
+    max_steps: int = 200,
+) -> Int[Array, "runs robots"]:
+    """Drive several robots at once in one world, where they see and hit one another.
+
+    Robot `i` begins in start circle `i` of the map. Who has arrived or collided is there no longer.
+
+    Args:
+        params: constants of the driver, the same for all.
+        map: with a start circle for each robot, as `families.family_map(..., robots=3)` has them.
+        keys: one per run.
+        max_steps: control steps after which those that still drive are given up.
+
+    Returns:
+        `Status` of each robot of each run, int32.
+
+    Raises:
+        ValueError: the map has fewer start circles than room for them.
+    """
+    require_keys(keys)
+    probs = concrete(map.start_probs)
+    require(
+        probs is None or bool((probs > 0).all()),
+        f"start_probs={None if probs is None else probs.tolist()}: expected a start circle for "
+        "each robot; make the map with robots=2 or more, or max_starts as many as starts",
+    )
+    return _together(params, map, keys, max_steps)
+
+
+@functools.partial(jax.jit, static_argnums=3)
+def _together(
+    params: DriverParams, map: world.WorldParams, keys: Key[Array, " runs"], max_steps: int
+) -> Int[Array, "runs robots"]:
+    circles = jnp.arange(map.starts.shape[0])
+
+    def run(key: Key[Array, ""]) -> Int[Array, " robots"]:
+        begin = jax.vmap(lambda k, c: world.reset(map, key=k, circle=c))
+        robots = begin(jax.random.split(key, circles.shape[0]), circles)
+
+        def step(carry: tuple[world.WorldState, Array], _: None) -> tuple[Any, None]:
+            robots, status = carry
+            active = status == Status.TIMEOUT
+            readings = world.observe_many(map, robots, active=active)
+            steering = jax.vmap(lambda r: driver_steering(params, r))(readings)
+            robots, outcome = world.step_many(map, robots, steering, active=active)
+            for ended, name in zip(outcome, _ENDS, strict=True):
+                status = jnp.where(ended, jnp.int32(name), status)
+            return (robots, status), None
+
+        # Out of steps until something else is known.
+        late = jnp.full(circles.shape, Status.TIMEOUT, jnp.int32)
+        return jax.lax.scan(step, (robots, late), length=max_steps)[0][1]
+
+    return jax.vmap(run)(keys)
+
+
+_ENDS = (Status.COLLIDED, Status.ARRIVED, Status.NON_FINITE)
+"""Of the flags of `world.Outcome`, in their order."""

@@ -18,7 +18,8 @@ import numpy as np
 
 from jaxsnn._checks import require, require_choice, require_whole
 from jaxsnn.drivers import DRIVERS, drive
-from jaxsnn.maps import make_map
+from jaxsnn.map_axes import hardened
+from jaxsnn.maps import Number, make_map
 from jaxsnn.planner import path_field
 from jaxsnn.shapes import Corners, cup, regular
 from jaxsnn.trials import success_rate
@@ -69,9 +70,22 @@ def is_admitted(measured: Difficulty) -> bool:
     return measured.blind < 10.0 and reflexes < 50.0 and math.isfinite(measured.shortest)
 
 
-@functools.lru_cache(maxsize=256)
-def family_map(family: str, split: str, number: int) -> WorldParams:
+def family_map(
+    family: str,
+    split: str,
+    number: int,
+    *,
+    robots: int = 1,
+    moving: int = 0,
+    sonar_stuck: dict[int, Number] | None = None,
+    sonar_noise: Number = 0.0,
+    distance_noise: Number = 0.0,
+    angle_noise: Number = 0.0,
+) -> WorldParams:
     """Map `number` of a family: the first admitted one of the draws of its seed.
+
+    What the options add is added to the admitted map: walls, obstacles that stand still, target and
+    first start circle are the same with them and without.
 
     Args:
         family: "open" (one cup in an empty room), "cluttered" (small cups and convex obstacles),
@@ -79,23 +93,67 @@ def family_map(family: str, split: str, number: int) -> WorldParams:
             gaps on alternating sides).
         split: "train", "validation" or "test".
         number: 0 to 999,999; the same number gives the same map for ever.
+        robots: start circles, the map's own and the nearest free places to it, one for each robot
+            (`drivers.drive_together`); at most 8. More than two change the padding.
+        moving: circles of 12 to 24 px that go to and fro by 2 to 6 px per step, at most 8; the
+            same number gives the same ones for ever, and more of them begin with the fewer.
+        sonar_stuck: failed sonars, `{index: what it reports [px]}`.
+        sonar_noise: standard deviation of each sonar [px].
+        distance_noise: standard deviation of the distance sensor [px].
+        angle_noise: standard deviation of the angle sensor [deg].
 
     Raises:
-        ValueError: a name is unknown, the number is out of range, or no draw was admitted.
+        TypeError: a number is no whole number.
+        ValueError: a name is unknown, a number or an option is out of range, no draw was admitted,
+            or the map has no room for so many robots or moving obstacles.
+
+    Example:
+        >>> map = family_map("detour", "train", 0, moving=3, sonar_noise=5.0)
+        >>> int(map.circle_mask.sum()), float(map.sonar_noise)
+        (3, 5.0)
     """
     require_choice("family", family, tuple(FAMILIES))
     require_choice("split", split, tuple(SPLITS))
     require_whole("number", number, 0, "count from 0")
     require(number < 1_000_000, f"number={number}: expected less than 1,000,000; lower it")
-    code = list(FAMILIES).index(family)
-    rng = np.random.default_rng([code, SPLITS[split] + number])
+    arguments, map = admitted_draw(family, split, number)
+    given: dict[str, Any] = {
+        "robots": robots, "moving": moving, "sonar_stuck": sonar_stuck, "sonar_noise": sonar_noise,
+        "distance_noise": distance_noise, "angle_noise": angle_noise,
+    }  # fmt: skip
+    if given == _PLAIN:
+        return map
+    # A stream of its own: the draw of the map is what it is without it.
+    rng = np.random.default_rng([*_seed(family, split, number), 1])
+    return hardened(arguments, map, rng, **given)
+
+
+_PLAIN = {
+    "robots": 1, "moving": 0, "sonar_stuck": None, "sonar_noise": 0.0, "distance_noise": 0.0,
+    "angle_noise": 0.0,
+}  # fmt: skip
+
+
+def _seed(family: str, split: str, number: int) -> list[int]:
+    return [list(FAMILIES).index(family), SPLITS[split] + number]
+
+
+@functools.lru_cache(maxsize=256)
+def admitted_draw(family: str, split: str, number: int) -> tuple[dict[str, Any], WorldParams]:
+    """The first admitted draw of a seed: its arguments of `make_map`, and the map.
+
+    Raises:
+        ValueError: no draw was admitted.
+    """
+    rng = np.random.default_rng(_seed(family, split, number))
     for _ in range(ATTEMPTS):
+        arguments = FAMILIES[family](rng)
         try:
-            map = make_map(**FAMILIES[family](rng))
+            map = make_map(**arguments)
         except ValueError:
             continue  # a start in an obstacle, an obstacle in a wall, no way through
         if is_admitted(difficulty(map)):
-            return map
+            return arguments, map
     raise ValueError(
         f"number={number}: expected an admitted {family} map within {ATTEMPTS} draws; take another"
     )

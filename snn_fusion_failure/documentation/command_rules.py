@@ -217,7 +217,7 @@ AREAS = {
     ),
     "robots": (
         "train_snn", "study_transfer", "study_snn", "figures_snn", "compare_snn", "bench_snn",
-        "train_rl", "study_detour", "study_guidance", "study_lifelong",
+        "train_rl", "study_detour", "study_guidance", "study_lifelong", "study_families",
     ),
     "sweeps": ("sweep", "bench_sweep"),
     "fusion": (

@@ -20,6 +20,11 @@ ROBOTS = (
         forget="results/study_guidance.json",
     ),
     Rule(
+        "study_families.py",
+        "--families open --axes '4 robots in one world' --maps 1 --robots 1 --trials 1",
+        forget="results/study_families.json",
+    ),
+    Rule(
         "study_lifelong.py",
         f"{_ROBOT} --models blind --rows 'weak motor' --trials 1",
         forget="results/study_lifelong.json",

@@ -81,7 +81,7 @@ def test_admission_is_blind_below_10_reflexes_below_50_and_a_way():
 
 def test_a_family_map_is_a_function_of_its_number_and_admitted():
     map = family_map("detour", "train", 0)
-    family_map.cache_clear()
+    families.admitted_draw.cache_clear()
     jax.tree.map(np.testing.assert_array_equal, map, family_map("detour", "train", 0))
     assert is_admitted(difficulty(map))
     assert not np.array_equal(map.target, family_map("detour", "test", 0).target)

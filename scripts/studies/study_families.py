@@ -4,17 +4,20 @@
 
 For the four families of `jaxsnn.families`, on the first maps of the test split: success of the
 drivers that learn nothing (blind, reflex 60, reflex 100), from the same starts everywhere, the
-share of maps that the planner solves with 15 px to spare and the length of its paths. Then
-the family "detour" with one axis switched on at a time: moving obstacles, a stuck sonar, noise,
-several robots in one world (`family_map(..., moving=4)` and so on; the walls stay the same). No
-network is trained. Writes `results/study_families.json`; two CPU-minutes, most of them to draw the
-maps of "cluttered".
+share of maps that the planner solves with 15 px to spare and the length of its paths (`path`, and
+`path_shortest` as near to everything as the robot's radius lets it). Then the family "detour" with
+one axis switched on at a time: moving obstacles, a stuck sonar, noise, several robots in one world
+(`family_map(..., moving=4)` and so on; the walls stay the same). Last the maps with a name, S1 to
+S3 and D1 to D3. No network is trained. Writes `results/study_families.json`; two CPU-minutes, most
+of them to draw the maps of "cluttered".
 """
 
 from __future__ import annotations
 
 import dataclasses
-from collections.abc import Iterator
+import functools
+import math
+from collections.abc import Callable, Iterator, Sequence
 from typing import Any
 
 from snn_fusion_failure.records.rows import record_table, summarize
@@ -35,6 +38,8 @@ AXES: dict[str, dict[str, Any]] = {
 }  # fmt: skip
 """Row of the table -> options of `family_map`."""
 BASE = "detour"
+NAMED = {f"Scenario {i}": f"S{i}" for i in (1, 2, 3)} | {f"D{i}": f"D{i}" for i in (1, 2, 3)}
+"""Row of the table -> name of a map."""
 TITLE = "Map families and axes of difficulty: drivers that learn nothing, and the planner"
 
 
@@ -45,6 +50,8 @@ class Config:
     families: tuple[str, ...] = FAMILIES
     axes: tuple[str, ...] = tuple(AXES)
     """Of the family "detour", each by itself."""
+    named: tuple[str, ...] = tuple(NAMED)
+    """Maps with a name."""
     maps: int = 20
     """First ones of the test split."""
     robots: int = 16
@@ -61,11 +68,22 @@ def measured(config: Config, map: Any) -> dict[str, tuple[str, str, float]]:
     if len(map.starts) > 2:
         found = together(config, map)
     rates = {name: ("sr_testing", "%", rate) for name, rate in found.items()}
-    solved = 100.0 * (shortest < float("inf"))
-    return rates | {
-        "planner": ("share_solved", "%", solved),
-        "planner, shortest path": ("path", "px", shortest),
-    }
+    solved = math.isfinite(shortest)
+    ways = {"planner, path": ("path", "px", shortest)} if solved else {}
+    return rates | ways | {
+        "planner": ("share_solved", "%", 100.0 * solved),
+        "planner, shortest path": ("path_shortest", "px", shortest_path(map)),
+    }  # fmt: skip
+
+
+def shortest_path(map: Any) -> float:
+    """Mean length of the shortest ways from the start circles, by the robot's own radius [px]."""
+    import numpy as np
+
+    from jaxsnn.planner import path_field
+
+    drawn = np.asarray(map.start_probs) > 0
+    return float(np.mean(path_field(map).lengths(np.asarray(map.starts, np.float64)[drawn, :2])))
 
 
 def together(config: Config, map: Any) -> dict[str, float]:
@@ -85,21 +103,26 @@ def together(config: Config, map: Any) -> dict[str, float]:
     return {name: 100.0 * float(np.mean(end == Status.ARRIVED)) for name, end in ends.items()}
 
 
-def cases(config: Config) -> Iterator[tuple[str, str, dict[str, Any]]]:
-    """Row, family and options of `family_map`."""
-    for family in config.families:
-        yield family, family, {}
-    for axis in config.axes:
-        yield f"{BASE}, {axis}", BASE, AXES[axis]
+def cases(config: Config) -> Iterator[tuple[str, Sequence[Callable[[], Any]]]]:
+    """Row, and what makes its maps."""
+    from jaxsnn.families import family_map
+    from jaxsnn.map_files import named_map
+
+    rows: list[tuple[str, str, dict[str, Any]]] = [(f, f, {}) for f in config.families]
+    rows += [(f"{BASE}, {axis}", BASE, AXES[axis]) for axis in config.axes]
+    for row, family, options in rows:
+        make = functools.partial(family_map, family, "test", **options)
+        yield row, [functools.partial(make, number=number) for number in range(config.maps)]
+    for row in config.named:
+        yield row, [functools.partial(named_map, NAMED[row])]
 
 
 def main(config: Config) -> dict[str, float]:
     """Measure every case; returns the success of the better reflex by row."""
-    from jaxsnn.families import family_map
-
     for name, given, allowed in (
         ("families", config.families, FAMILIES),
         ("axes", config.axes, tuple(AXES)),
+        ("named", config.named, tuple(NAMED)),
     ):
         if unknown := [g for g in given if g not in allowed]:
             raise ValueError(f"{name}={unknown}: expected some of {list(allowed)}; choose")
@@ -107,18 +130,18 @@ def main(config: Config) -> dict[str, float]:
         raise ValueError(f"maps={config.maps}: expected at least one; raise it")
     check_recordable()
     enable_compilation_cache()
-    todo, best, rows = list(cases(config)), {}, []
+    todo, best = list(cases(config)), {}
+    rows: list[dict[str, Any]] = []
     with progress() as bar:
-        task = bar.add_task("maps", total=len(todo) * config.maps, status="")
-        for row, family, options in todo:
+        task = bar.add_task("maps", total=sum(len(maps) for _, maps in todo), status="")
+        for row, maps in todo:
             values: dict[str, list[float]] = {}
             units: dict[str, tuple[str, str]] = {}
-            for number in range(config.maps):
-                map = family_map(family, "test", number, **options)
-                for model, (metric, unit, value) in measured(config, map).items():
+            for make in maps:
+                for model, (metric, unit, value) in measured(config, make()).items():
                     values.setdefault(model, []).append(value)
                     units[model] = metric, unit
-                bar.update(task, advance=1, status=f"{row}, map {number}")
+                bar.update(task, advance=1, status=row)
             for model, (metric, unit) in units.items():
                 rows.append(
                     {"row": row, "model": model.split(",")[0], "metric": metric, "unit": unit,

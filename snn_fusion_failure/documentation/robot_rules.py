@@ -21,7 +21,7 @@ ROBOTS = (
     ),
     Rule(
         "study_families.py",
-        "--families open --axes '4 robots in one world' --maps 1 --robots 1 --trials 1",
+        "--families open --axes '4 robots in one world' --named D1 --maps 1 --robots 1 --trials 1",
         forget="results/study_families.json",
     ),
     Rule(

@@ -11,7 +11,7 @@ import numpy as np
 from jaxtyping import Float
 
 from failure.estimates import check_threshold
-from failure.performances import Performance
+from failure.performances import Performance, check_rows
 
 
 def merge_points(
@@ -90,10 +90,7 @@ def design_points(
         used += len(x)
         with jax.enable_x64(True):
             y = np.asarray(performance(jnp.asarray(x)), np.float64)
-        if y.shape != x.shape[:1]:
-            raise ValueError(
-                f"performance: y.shape={y.shape}: expected {x.shape[:1]}, one value per row"
-            )
+        check_rows(y, x)
         return np.where(np.isfinite(y), y, -np.inf)
 
     y = simulate(u)

@@ -10,7 +10,7 @@ from jaxtyping import Float
 
 from failure.descents import COSINE, GAP, Descent, by_gradients, by_values, cosine_of
 from failure.estimates import GOOD, check_threshold
-from failure.performances import Counted, Performance, Slopes
+from failure.performances import Counted, Performance, Slopes, check_rows
 
 
 class DesignPoint(NamedTuple):
@@ -147,7 +147,10 @@ def onto_boundary(
     low, high = 0.0, 1.0
     for _ in range(steps):
         middle = 0.5 * (low + high)
-        value = float(np.nan_to_num(np.asarray(performance((middle * x)[None]))[0], nan=-np.inf))
+        trial = (middle * x)[None]
+        y = np.asarray(performance(trial))
+        check_rows(y, trial)
+        value = float(np.nan_to_num(y[0], nan=-np.inf))
         low, high = (low, middle) if value > threshold else (middle, high)
     return high * x
 

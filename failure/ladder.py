@@ -10,7 +10,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array
 
-from failure.performances import Performance
+from failure.performances import Performance, check_rows
 
 LEAST_SEEDS = 10
 """Fewer samples than this above a rung cannot carry its chains."""
@@ -83,6 +83,7 @@ def _one_run(
 
     def evaluate(u: Array) -> tuple[Array, Array]:
         y = performance(u)
+        check_rows(y, u)
         bad = ~jnp.isfinite(y)
         return jnp.where(bad, -jnp.inf, y), jnp.sum(bad)
 

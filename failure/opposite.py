@@ -8,7 +8,7 @@ import jax
 import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
-from failure.performances import Counted, Performance
+from failure.performances import Counted, Performance, check_rows
 
 REACH = 1.7
 """Wide samples have a standard deviation at which the nearest region is this many away."""
@@ -35,9 +35,14 @@ def check_scan(scan: int) -> None:
 def fails(
     performance: Performance | Counted, threshold: float, x: Float[np.ndarray, "n D"]
 ) -> Bool[np.ndarray, " n"]:
-    """Which rows fail; invalid ones do not."""
+    """Which rows fail; invalid ones do not.
+
+    Raises:
+        ValueError: outputs that are not one per row.
+    """
     with jax.enable_x64(True):
         y = np.asarray(performance(x), np.float64)
+    check_rows(y, x)
     return np.nan_to_num(y, nan=-np.inf, posinf=-np.inf) > threshold
 
 

@@ -16,6 +16,29 @@ Performance = Callable[[Any], Any]
 Slopes = Callable[[Any], tuple[Any, Any]]
 
 
+def check_rows(y: Any, x: Any) -> None:
+    """Refuse outputs that are not one per row: broadcast, one would stand for all samples.
+
+    The shapes are static, so that the check holds for traced values as well.
+
+    Args:
+        y: what a performance function gave.
+        x: `[n, D]`, what it was given.
+
+    Raises:
+        ValueError: `y` is not `[n]`.
+
+    Example:
+        >>> check_rows(np.zeros(1), np.zeros((4, 2)))
+        Traceback (most recent call last):
+        ValueError: performance: y.shape=(1,): expected (4,), one value per row
+    """
+    if np.shape(y) != np.shape(x)[:1]:
+        raise ValueError(
+            f"performance: y.shape={np.shape(y)}: expected {np.shape(x)[:1]}, one value per row"
+        )
+
+
 @lru_cache(maxsize=32)
 def traceable(performance: Performance, dim: int) -> Performance:
     """The function itself where jax can trace it; else one that calls it back from the program.
@@ -36,10 +59,7 @@ def traceable(performance: Performance, dim: int) -> Performance:
     def on_host(words: Any) -> np.ndarray:
         x = np.ascontiguousarray(words).view(np.float64)[..., 0]
         y = np.asarray(performance(x), np.float64)
-        if y.shape != x.shape[:1]:
-            raise ValueError(
-                f"performance: y.shape={y.shape}: expected {x.shape[:1]}, one value per row"
-            )
+        check_rows(y, x)
         return np.ascontiguousarray(y)[:, None].view(np.uint32)
 
     def called(x: Any) -> Any:
@@ -91,10 +111,7 @@ class Counted:
         """Values `[n]` of `x [n, D]`, NaN where invalid."""
         with jax.enable_x64(True):
             y = np.array(self._performance(jnp.asarray(x)), np.float64)
-        if y.shape != x.shape[:1]:
-            raise ValueError(
-                f"performance: y.shape={y.shape}: expected {x.shape[:1]}, one value per row"
-            )
+        check_rows(y, x)
         self.n_values += len(x)
         self.n_invalid += int(np.sum(~np.isfinite(y)))
         y = np.where(np.isfinite(y), y, np.nan)

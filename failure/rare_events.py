@@ -27,7 +27,7 @@ from failure.form import design_points, merge_points
 from failure.hlrf import DesignPoint, find_design_point
 from failure.lines import line_sampling
 from failure.opposite import check_scan, opposite_sides_fail, strangers_found, wide_strangers
-from failure.performances import Performance
+from failure.performances import Performance, check_rows
 from failure.subset import subset_simulation
 
 ALIKE = 0.9
@@ -70,7 +70,7 @@ def monte_carlo(
         Estimate.
 
     Raises:
-        ValueError: a threshold that is not finite.
+        ValueError: a threshold that is not finite; outputs that are not one per draw.
 
     Source: Clopper and Pearson (1934) for the interval.
 
@@ -87,6 +87,7 @@ def monte_carlo(
             size = min(batch, n - start)
             x = jax.random.normal(jax.random.fold_in(key, start), (size, dim))
             y = np.asarray(performance(x))
+            check_rows(y, x)
             hits += int(np.sum(y > threshold))
             invalid += int(np.sum(~np.isfinite(y)))
     lower, upper = clopper_pearson(hits, n)
@@ -136,7 +137,8 @@ def importance_sampling(
 
     Raises:
         ValueError: no point, or one that is not finite; a threshold that is not finite; a
-            nominal share that is not in (0, 1); a scan below 0.
+            nominal share that is not in (0, 1); a scan below 0; outputs that are not one per
+            sample.
 
     Source: Hesterberg (1995) for the defensive mixture; Kahn and Harris (1951).
 
@@ -167,6 +169,7 @@ def importance_sampling(
         log_ratio = u @ shifts.T - 0.5 * jnp.sum(shifts**2, 1)[None] + log_share[None]
         weight = np.asarray(jnp.exp(-jax.scipy.special.logsumexp(log_ratio, axis=1)))
         y = np.asarray(performance(u))
+    check_rows(y, u)
     failed = y > threshold
     term = weight * failed
     invalid = int(np.sum(~np.isfinite(y)))

@@ -18,7 +18,7 @@ from failure.estimates import (
 )
 from failure.ladder import LEAST_SEEDS, Replicates, ladder_program
 from failure.opposite import wide_scale
-from failure.performances import Performance, traceable
+from failure.performances import Performance, check_rows, traceable
 
 
 def _strangers(
@@ -31,6 +31,7 @@ def _strangers(
     scale = wide_scale(float(np.median(runs.depth[found])))
     x = scale * jax.random.normal(key, (n, dim))
     y = np.asarray(jax.jit(performance)(x))
+    check_rows(y, x)
     fails = np.asarray(x)[y > threshold]
     if len(fails) == 0:
         return 0
@@ -86,7 +87,7 @@ def subset_simulation(
 
     Raises:
         ValueError: a threshold that is not finite, fewer than 3 replicates, a share that is not in
-            (0, 0.5], or `n * share` below 10.
+            (0, 0.5], or `n * share` below 10; outputs that are not one per sample.
 
     Source: Au and Beck (2001); Papaioannou et al. (2015) for the moves. Deviation: replicates in
     the place of the analytic coefficient of variation.

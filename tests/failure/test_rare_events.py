@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from scipy import integrate, stats
 
-from failure import rare_events
+from failure import opposite, rare_events
 from failure.problems import make_problem
 
 DIM = 60
@@ -274,6 +274,30 @@ def test_one_effective_sample_is_no_interval():
         assert not result.known and result.lower == 0.0
         assert stats.norm.sf(5.0) <= result.upper <= 1.0
         assert "effective samples" in result.verdict
+
+
+@pytest.mark.parametrize("keep", [slice(0, 1), slice(0, -1), 0], ids=repr)
+@pytest.mark.parametrize("kind", ["traced", "numpy"])
+def test_fewer_outputs_than_samples_are_refused_and_not_broadcast(keep, kind):
+    def short(x):
+        return (jnp if kind == "traced" else np).asarray(x[:, 0])[keep]
+
+    point = unit(0, 3.0)
+    calls = [
+        lambda: rare_events.monte_carlo(short, 1.0, DIM, key=KEY, n=50, batch=20),
+        lambda: rare_events.importance_sampling(short, 1.0, point[None], key=KEY, n=50, scan=0),
+        lambda: opposite.fails(short, 1.0, np.ones((5, DIM))),
+        lambda: rare_events.design_points(short, 1.0, np.stack([point, 2 * point])),
+    ]
+    if kind == "traced":
+        calls.append(
+            lambda: rare_events.subset_simulation(short, 1.0, DIM, key=KEY, n=100, explore=0)
+        )
+    for call in calls:
+        with pytest.raises(
+            ValueError, match=r"y\.shape=\(.*\): expected \(\d+,\), one value per row"
+        ):
+            call()
 
 
 @pytest.mark.parametrize("threshold", [np.nan, np.inf])

@@ -12,7 +12,7 @@ from typing import Any, Protocol, runtime_checkable
 
 import numpy as np
 
-from failure.simulators.processes import Group, SimulatorError
+from failure.simulators.processes import Group, never_worked
 from failure.simulators.result_cache import Cache
 from failure.status import Status
 
@@ -106,7 +106,7 @@ class Batch:
         results: dict[bytes, Result] = {}
         waiting: queue.SimpleQueue[np.ndarray] = queue.SimpleQueue()
         for row in {r.tobytes(): r for r in x}.values():
-            stored = store.load(row) if store else None
+            stored = store.load(row, self.n_specs) if store else None
             if stored is not None and (stored[1] == Status.GOOD or not self.retry_failed):
                 self._worked |= stored[1] == Status.GOOD
                 results[row.tobytes()] = stored
@@ -161,10 +161,7 @@ class Batch:
             self._failed += result[1] not in (Status.GOOD, Status.NOT_FINITE)
             hopeless = not self._worked and self.give_up and self._failed >= self.give_up
         if hopeless:
-            raise SimulatorError(
-                f"the simulator has failed {self._failed} times and never worked; its last "
-                f"message: {result[2]}"
-            )
+            raise never_worked(self._failed, result[2])
 
     def _try(self, one: Attempt, row: np.ndarray) -> Result:
         result: Result = ([], Status.FAILED, "")

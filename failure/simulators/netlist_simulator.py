@@ -107,6 +107,19 @@ class NetlistSimulator:
         )
 
     @property
+    def identity(self) -> str:
+        """What a run folder knows the simulator by: all that its answers depend on."""
+
+        def short(*parts: object) -> str:
+            return hashlib.sha256(repr(parts).encode()).hexdigest()[:12]
+
+        return (
+            f"netlist command={self.command!r} deck={short(self.deck.text, self.deck.digest)} "
+            f"vary={short(self.variation.varied, np.asarray(self.variation.correlation).tolist())} "
+            f"limits={short(*self.limits)} corners={short(*self.corners)} invalid={self.invalid}"
+        )
+
+    @property
     def names(self) -> tuple[str, ...]:
         """Names of the measures, each once."""
         return tuple(dict.fromkeys(limit.name for limit in self.limits))
@@ -199,7 +212,7 @@ class NetlistSimulator:
             return found, np.zeros(len(found), np.int64)
         return found, status.max(axis=1).astype(np.int64)
 
-    def identity(self, text: str) -> str:
+    def name_of(self, text: str) -> str:
         """What the cache knows a run by: command, deck, included files."""
         parts = "\0".join((self.command, self.deck.digest, text))
         return hashlib.sha256(parts.encode()).hexdigest()
@@ -210,10 +223,16 @@ class NetlistSimulator:
             return None
         self._kept[label] += 1
         self.keep.mkdir(parents=True, exist_ok=True)
-        path = self.keep / f"{label}_{self.identity(text)[:12]}.cir"
+        path = self.keep / f"{label}_{self.name_of(text)[:12]}.cir"
         path.write_text(text, encoding="utf-8")
         path.with_suffix(".log").write_text(log, encoding="utf-8")
         return path
+
+
+def _numbers(record: dict[str, Any]) -> tuple[dict[str, float], str]:
+    """What a finished run has printed, by its record in the cache."""
+    numbers = {str(name): float(value) for name, value in record["numbers"].items()}
+    return numbers, str(record["trouble"])
 
 
 class _Run:
@@ -233,12 +252,12 @@ class _Run:
         text = owner.deck_of(row[:-1], owner.corners[int(row[-1])])
         path = None
         if owner.cache is not None:
-            name = owner.identity(text)
+            name = owner.name_of(text)
             path = Path(owner.cache) / name[:2] / f"{name}.json"
-            stored = load_record(path)
-            if stored is not None and "numbers" in stored:
+            stored = load_record(path, _numbers)
+            if stored is not None:
                 owner._from_cache += 1
-                return self._read(stored["numbers"], str(stored["trouble"]), Status.FAILED)
+                return self._read(*stored, Status.FAILED)
         numbers, log, status = self._simulate(text, timeout)
         trouble = printed_trouble(log)
         if not all(np.isfinite(numbers.get(n, np.nan)) for n in owner.names):

@@ -47,6 +47,13 @@ class SimulatorError(ValueError):
     """A simulator cannot be started, has never worked, or failed where that was to stop the run."""
 
 
+def never_worked(failed: int, message: str) -> SimulatorError:
+    """The error of a simulator that has failed time and again and never worked."""
+    return SimulatorError(
+        f"the simulator has failed {failed} times and never worked; its last message: {message}"
+    )
+
+
 def _guard() -> subprocess.Popen[str]:
     held = _guards.get(os.getpid())
     if held is None or held.poll() is not None:

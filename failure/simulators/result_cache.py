@@ -7,30 +7,39 @@ import json
 import logging
 import os
 import tempfile
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 
 _log = logging.getLogger("failure.simulators")
 
 
-def load_record(path: Path) -> dict[str, Any] | None:
-    """A record that `save_record` has written, or None; what cannot be read is set aside, named."""
+T = TypeVar("T")
+
+
+def load_record(path: Path, read: Callable[[dict[str, Any]], T]) -> T | None:
+    """A record that `save_record` has written, or None; what cannot be read is set aside, named.
+
+    Args:
+        path: file of the record.
+        read: what is wanted of it; a record without it cannot be read either.
+    """
     try:
-        record = json.loads(path.read_text(encoding="utf-8"))
+        record = json.loads(path.read_bytes())
         if not isinstance(record, dict):
             raise ValueError("no record")
+        return read(record)
     except FileNotFoundError:
         return None
-    except (ValueError, UnicodeDecodeError) as error:
+    except (ValueError, KeyError, TypeError, AttributeError) as error:
         aside = path.with_suffix(".broken")
         os.replace(path, aside)
-        _log.warning("%s cannot be read (%s): set aside, simulated again", aside, error)
+        why = f"{type(error).__name__}: {error}"
+        _log.warning("%s cannot be read (%s): set aside, simulated again", aside, why)
         return None
-    return record
 
 
 def save_record(path: Path, record: dict[str, Any]) -> None:
@@ -66,13 +75,23 @@ class Cache:
         name = digest.hexdigest()
         return self.folder / name[:2] / f"{name}.json"
 
-    def load(self, x: np.ndarray) -> tuple[list[float], int, str] | None:
-        """(specs, status, message) of a sample, or None when it has not been simulated."""
-        stored = load_record(self.path(x))
-        if stored is None:
-            return None
-        specs = [float("nan") if v is None else float(v) for v in stored["specs"]]
-        return specs, int(stored["status"]), str(stored["message"])
+    def load(
+        self, x: np.ndarray, n_specs: int | None = None
+    ) -> tuple[list[float], int, str] | None:
+        """(specs, status, message) of a sample, or None when it has not been simulated.
+
+        Args:
+            x: the sample.
+            n_specs: how many specifications it must have, where that is known.
+        """
+
+        def read(stored: dict[str, Any]) -> tuple[list[float], int, str]:
+            specs = [float("nan") if v is None else float(v) for v in stored["specs"]]
+            if n_specs is not None and len(specs) != n_specs:
+                raise ValueError(f"{len(specs)} specifications: expected {n_specs}")
+            return specs, int(stored["status"]), str(stored["message"])
+
+        return load_record(self.path(x), read)
 
     def save(self, x: np.ndarray, specs: Sequence[float], status: int, message: str) -> None:
         """Write a sample atomically."""

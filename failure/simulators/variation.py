@@ -118,6 +118,25 @@ class Variation:
         return np.where(relative, np.abs(nominal), 1.0) * sigma
 
 
+def _read_matrix(text: str) -> tuple[list[str], np.ndarray]:
+    """Names and coefficients of a CSV file, its first line the names."""
+    path = Path(text)
+    if not path.is_file():
+        raise FileNotFoundError(f"correlate={text!r}: expected a file; there is none")
+    try:
+        with path.open(newline="", encoding="utf-8") as file:
+            head, *rows = list(csv.reader(file)) or [[]]
+        values = np.array(rows, np.float64)
+        if not head or values.shape != (len(head), len(head)):
+            raise ValueError(f"{len(head)} names over numbers of shape {values.shape}")
+    except (ValueError, csv.Error) as error:
+        raise ValueError(
+            f"correlate={text!r}: expected a line of names and a square of numbers in UTF-8; "
+            f"{error}"
+        ) from error
+    return head, values
+
+
 def parse_variation(vary: Sequence[str], correlate: Sequence[str] = ()) -> Variation:
     """The variation that the options of a command describe.
 
@@ -126,6 +145,7 @@ def parse_variation(vary: Sequence[str], correlate: Sequence[str] = ()) -> Varia
         correlate: `a,b,c:0.8` gives all pairs of a group one coefficient; `FILE.csv` a whole
             matrix, its first line the names.
     Raises:
+        FileNotFoundError: there is no such file.
         ValueError: another form, an unknown name, or no correlation matrix.
 
     Example:
@@ -144,15 +164,9 @@ def parse_variation(vary: Sequence[str], correlate: Sequence[str] = ()) -> Varia
 
     for text in correlate:
         if text.lower().endswith(".csv"):
-            with Path(text).open(newline="", encoding="utf-8") as file:
-                head, *rows = list(csv.reader(file))
+            head, values = _read_matrix(text)
             places = [row(name, text) for name in head]
-            try:
-                matrix[np.ix_(places, places)] = np.array(rows, np.float64)
-            except ValueError as error:
-                raise ValueError(
-                    f"correlate={text!r}: expected a line of names and a square of numbers"
-                ) from error
+            matrix[np.ix_(places, places)] = values
             continue
         members, colon, value = text.rpartition(":")
         try:

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import dataclasses
 import sys
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from failure.search.storage import identity_of
 from failure.simulators import SimulatorError, netlist_simulator
 from failure.simulators.corners import Corner, pvt_corners
 from failure.simulators.deck import parse_deck, read_deck
@@ -161,6 +163,20 @@ def test_a_correlation_matrix_is_read_by_name(tmp_path: Path) -> None:
 
 
 @pytest.mark.parametrize(
+    "content",
+    [b"", b"\n", b"b,a\n", b"b,a\n1,0.3\n", b"a,\xe9\n1,0\n0,1\n", b"a,b\n1,x\n0,1\n", b"a\x00"],
+    ids=repr,
+)
+def test_a_correlation_file_that_is_none_is_named(tmp_path: Path, content: bytes) -> None:
+    file = tmp_path / "c.csv"
+    file.write_bytes(content)
+    with pytest.raises(ValueError, match=r"correlate='.*c\.csv': expected a line of names"):
+        parse_variation(["a:1", "b:1"], [str(file)])
+    with pytest.raises(FileNotFoundError, match=r"correlate='.*d\.csv': expected a file"):
+        parse_variation(["a:1", "b:1"], [str(tmp_path / "d.csv")])
+
+
+@pytest.mark.parametrize(
     ("vary", "correlate", "wanted"),
     [
         (["a"], [], "vary='a': expected NAME:SIGMA"),
@@ -291,6 +307,42 @@ def test_a_simulator_that_never_works_stops_at_once_with_its_message(command) ->
         simulator("ngspice")
     with pytest.raises(ValueError, match="invalid='skip': expected one of fail"):
         simulator(command[0], invalid="skip")
+
+
+def test_netlists_are_told_apart_by_all_that_their_answers_depend_on(command) -> None:
+    text = command[0]
+    same = simulator(text)
+    others = [
+        simulator(f"{text} "),
+        simulator(text, limits=["out<=0.7", "other>=0.5"]),
+        simulator(text, corners=(Corner("hot", (), 125.0),)),
+        simulator(text, invalid="ignore"),
+        dataclasses.replace(same, deck=dataclasses.replace(same.deck, text=same.deck.text + "\n*")),
+        dataclasses.replace(same, deck=dataclasses.replace(same.deck, digest="another include")),
+        dataclasses.replace(same, variation=parse_variation(["r1:2%", "r2:10"])),
+        dataclasses.replace(same, variation=parse_variation(["r1:1%", "r2:10"], ["r1,r2:0.5"])),
+    ]
+    names = [identity_of(one) for one in (same, *others)]
+    assert len(set(names)) == len(names) and all(names)
+    cheaper = simulator(text, workers=2, timeout=9.0, retries=3, cache=Path("c"), keep=Path("k"))
+    assert identity_of(cheaper) == names[0]
+    assert identity_of(same.__call__) != identity_of(others[1].__call__)
+
+
+@pytest.mark.parametrize(
+    "record", ["{}", "[]", '{"numbers": 3, "trouble": ""}', '{"numbers": {"out": "x"}}']
+)
+def test_a_record_of_a_run_without_its_numbers_is_simulated_again(
+    command, tmp_path: Path, record: str
+) -> None:
+    text, log = command
+    x = np.zeros((1, 2))
+    g, _ = simulator(text, cache=tmp_path / "cache")(x)
+    (path,) = (tmp_path / "cache").rglob("*.json")
+    path.write_text(record)
+    again, _ = simulator(text, cache=tmp_path / "cache")(x)
+    np.testing.assert_array_equal(again, g)
+    assert log.read_text().count("run") == 2 and path.with_suffix(".broken").exists()
 
 
 def test_shapes_are_checked(command) -> None:

@@ -103,6 +103,30 @@ def test_cache_pays_once_within_a_batch_and_between_runs(program, tmp_path: Path
     assert runs(log) == 5
 
 
+@pytest.mark.parametrize(
+    "record",
+    [
+        "{}",
+        '{"specs": [1.0, 2.0]}',
+        '{"specs": 3, "status": 0, "message": ""}',
+        '{"specs": [1.0], "status": 0, "message": ""}',
+        '{"specs": [1.0, 2.0], "status": null, "message": ""}',
+    ],
+)
+def test_a_record_without_its_parts_is_set_aside_and_simulated_again(
+    program, tmp_path: Path, record: str
+) -> None:
+    argv, log = program
+    x = np.array([[0.5, 2.0]])
+    simulate = CommandSimulator(argv, 2, cache=tmp_path / "cache")
+    specs, _ = simulate(x)
+    (path,) = (tmp_path / "cache").rglob("*.json")
+    path.write_text(record)
+    again, _ = simulate(x)
+    np.testing.assert_array_equal(again, specs)
+    assert runs(log) == 2 and path.with_suffix(".broken").read_text() == record
+
+
 def test_cache_key_follows_the_content_of_dependencies(program, tmp_path: Path) -> None:
     argv, log = program
     card = tmp_path / "card"

@@ -12,7 +12,7 @@ import numpy as np
 from failure.models.gp import GPParams
 from failure.search import bayesopt, storage, trees
 from failure.search.bayesopt import SearchConfig, SearchState, Surrogate
-from failure.search.evaluation import Simulate, evaluate
+from failure.search.evaluation import Simulate, check_worked, evaluate
 from failure.search.storage import identity_of
 from failure.search.task import sign_of
 
@@ -119,7 +119,7 @@ def run(
     train: bayesopt.TrainSpace | None = None,
     identity: str | None = None,
 ) -> SearchState:
-    """Search until the budget is spent.
+    """Search until the budget is spent, or until the simulator shows that it never works.
 
     Args:
         config: the search.
@@ -140,6 +140,8 @@ def run(
     Raises:
         ValueError: `folder` holds a run with other settings, column, sense, simulator or start
             (the budget may have grown); the simulator's answer has the wrong shape.
+        SimulatorError: after as many simulations as an initial design has, none is valid; it holds
+            the simulator's last message. What was simulated is in the folder.
 
     Example:
         >>> def simulate(x):
@@ -150,7 +152,7 @@ def run(
         (1, 6)
     """
     sign_of(sense)
-    mark = ""
+    mark, given, told = "", 0 if state is None else state.n, list[str]()
     if folder is not None:
         folder = Path(folder)
         name = identity_of(simulate) if identity is None else identity
@@ -161,6 +163,7 @@ def run(
         if start is not None and start.n and state.n == 0:
             state = start
             storage.append_log(folder, mark, state, state.n, {})
+        told = storage.messages(folder)
     elif state is None:
         state = bayesopt.init(config)
     while state.n < config.n_total:
@@ -177,4 +180,7 @@ def run(
             storage.append_log(folder, mark, state, found.y.shape[1], found.messages)
         if on_step is not None:
             on_step(state)
+        told += found.messages.values()
+        check_worked(state.y[:, given:], state.status[:, given:], config.n_init, told)
+    check_worked(state.y, state.status, config.n_init, told)
     return state

@@ -11,10 +11,12 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from typing import Any, TypeVar
 
+import jax
 import numpy as np
 
-from failure.search.evaluation import Simulate
+from failure.search.evaluation import AnswerError, Simulate
 from failure.search.storage import identity_of
+from failure.simulators.processes import SimulatorError
 
 T = TypeVar("T")
 
@@ -54,24 +56,43 @@ class _Exchange:
 def _answer(
     requests: list[tuple[np.ndarray, Future[Any]]], simulate: Simulate, multiple: int
 ) -> None:
-    """Simulate all requests at once and give each search its rows."""
+    """Simulate all requests at once and give each search its rows.
+
+    A simulator that raises is asked again for each search, so that one point does not discard the
+    points of the others.
+    """
     rows = [x.shape[0] for x, _ in requests]
     x = np.concatenate([x for x, _ in requests])
     # Few sizes, so that a compiled simulator is not compiled for every sum of requests.
     fill = -x.shape[0] % multiple
+    batch = np.concatenate([x, np.repeat(x[-1:], fill, axis=0)])
+
+    def fail(error: BaseException) -> None:
+        for _, future in requests:
+            future.set_exception(error)
+
     try:
-        specs, status = simulate(np.concatenate([x, np.repeat(x[-1:], fill, axis=0)]))
-        ends = np.cumsum(rows)
-        specs, status = np.asarray(specs), np.asarray(status)
+        answer = jax.block_until_ready(simulate(batch))
+    except Exception as error:
+        if len(requests) == 1 or isinstance(error, SimulatorError | AnswerError):
+            return fail(error)
+        for request in requests:
+            _answer([request], simulate, multiple)
+        return None
+    except BaseException as error:
+        return fail(error)
+    try:
+        specs, status = (np.asarray(part) for part in answer)
         if len(specs) < len(x) or len(status) < len(x):
-            raise ValueError(
+            raise AnswerError(
                 f"simulate: {len(specs)} rows of specs and {len(status)} of status: expected at "
                 f"least {len(x)}, one row per point"
             )
-    except BaseException as error:
-        for _, future in requests:
-            future.set_exception(error)
-        return
+    except (TypeError, ValueError) as error:
+        if isinstance(error, AnswerError):
+            return fail(error)
+        return fail(AnswerError(f"simulate: {error}: expected (specs [n, m], status [n])"))
+    ends = np.cumsum(rows)
     for (_, future), end, n in zip(requests, ends, rows, strict=True):
         future.set_result((specs[end - n : end], status[end - n : end]))
 

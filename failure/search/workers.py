@@ -11,7 +11,7 @@ from typing import NamedTuple
 import numpy as np
 
 from failure.search import bayesopt, storage
-from failure.search.evaluation import Evaluated, Simulate, evaluate
+from failure.search.evaluation import Evaluated, Simulate, check_worked, evaluate
 from failure.search.history import SearchState
 from failure.search.methods import METHODS, SearchConfig
 from failure.search.runs import load
@@ -68,6 +68,7 @@ def run_workers(
     Raises:
         ValueError: several seeds; a method without a surrogate, with a learned space or with
             batches of its own; no worker; the folder holds another run.
+        SimulatorError: nothing is valid after the initial design; see `run_search`.
 
     Example:
         >>> def simulate(x):
@@ -88,12 +89,13 @@ def run_workers(
         )
     if workers < 1:
         raise ValueError(f"workers={workers}: expected at least 1")
-    state, mark = bayesopt.init(config), ""
+    state, mark, told = bayesopt.init(config), "", list[str]()
     if folder is not None:
         folder = Path(folder)
         name = identity_of(simulate) if identity is None else identity
         mark = storage.claim(folder, config, column=column, sense=sense, simulator=name, start=None)
         state = load(config, folder, mark)
+        told = storage.messages(folder)
     ready: deque[_Point] = deque()
     running: dict[Future[Evaluated], _Point] = {}
 
@@ -117,6 +119,8 @@ def run_workers(
             storage.append_log(folder, mark, state, 1, found.messages)
         if on_step is not None:
             on_step(state)
+        told.extend(found.messages.values())
+        check_worked(state.y, state.status, config.n_init, told)
 
     with ThreadPoolExecutor(workers) as pool:
         while state.n < config.n_total:
@@ -137,4 +141,5 @@ def run_workers(
             ended, _ = wait(running, return_when=FIRST_COMPLETED)
             for done in ended:
                 finish(done)
+    check_worked(state.y, state.status, config.n_init, told)
     return state

@@ -14,6 +14,7 @@ from failure.search.runs import run
 from failure.search.storage import samples
 from failure.search.task import Task
 from failure.search.workers import run_workers
+from failure.simulators import SimulatorError
 
 TASK = Task("ball", 5.0, 6)
 
@@ -81,6 +82,19 @@ def test_workers_do_not_wait_for_the_slowest(tmp_path) -> None:
     longer = run_workers(search(n_init=12, n_total=32), simulate, workers=8, folder=tmp_path)
     assert calls[0] == 32
     np.testing.assert_array_equal(longer.x[0, :30], x)
+
+
+def test_workers_stop_a_simulator_that_never_works(tmp_path) -> None:
+    calls = []
+
+    def broken(x: np.ndarray) -> None:
+        calls.append(len(x))
+        raise KeyError("no licence")
+
+    for _ in range(2):
+        with pytest.raises(SimulatorError, match="never worked; its last message: KeyError: 'no l"):
+            run_workers(search(), broken, workers=2, folder=tmp_path, retries=0)  # type: ignore
+    assert 8 <= len(calls) < 24
 
 
 def test_bad_requests() -> None:

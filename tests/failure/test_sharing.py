@@ -76,6 +76,29 @@ def test_an_error_of_the_simulator_reaches_the_caller() -> None:
         side_by_side([lambda s: s(np.zeros((1, 3)))], broken)
 
 
+def test_a_point_that_raises_leaves_the_points_of_other_searches_alone() -> None:
+    def picky(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
+        if np.any(x[:, 0] > 1.2):
+            raise np.linalg.LinAlgError("singular matrix")
+        return sphere(x)
+
+    searches = [lambda s, m=m: runs.run(config(m), s) for m in METHODS]  # type: ignore[misc]
+    some = 0
+    for state in side_by_side(searches, picky, multiple=8):
+        bad = state.x[..., 0] > 1.2
+        np.testing.assert_array_equal(np.isnan(state.y), bad)
+        some += int(bad.sum())
+    assert some > 0
+
+
+def test_answers_that_belong_to_no_point_are_an_error_of_the_program() -> None:
+    search = lambda s: runs.run(config("ridge_corner"), s)  # noqa: E731
+    with pytest.raises(ValueError, match=r"1 rows of specs and 1 of status: expected at least 20"):
+        side_by_side([search, search], lambda x: (np.zeros((1, 1)), np.zeros(1)))
+    with pytest.raises(ValueError, match=r"simulate: .*: expected \(specs \[n, m\], status"):
+        side_by_side([search, search], lambda x: None)  # type: ignore[arg-type,return-value]
+
+
 def test_bad_input() -> None:
     assert side_by_side([], sphere) == []
     with pytest.raises(ValueError, match="multiple=0"):

@@ -1,6 +1,8 @@
 """Run folders: complete identity, growth, damaged files, shapes at the simulator's border."""
 
+import dataclasses
 import json
+from functools import partial
 
 import numpy as np
 import pytest
@@ -10,6 +12,7 @@ from failure.search.methods import SearchConfig
 from failure.search.storage import identity_of, samples
 from failure.search.task import Task
 from failure.search.trees import load_tree, save_tree
+from failure.simulators import SimulatorError
 from failure.status import Status
 
 TASK = Task("box", 3.0, 3)
@@ -161,10 +164,28 @@ def test_fewer_rows_than_points_are_refused():
         runs.run(config(), two, sense="mni")
 
 
-def test_a_point_that_raises_leaves_its_neighbours_alone_and_says_why(tmp_path):
+class LicenceError(Exception):
+    """An error that no library knows."""
+
+
+@pytest.mark.parametrize(
+    "error",
+    [
+        RuntimeError("singular matrix"),
+        np.linalg.LinAlgError("singular matrix"),
+        ValueError("no operating point"),
+        KeyError("vdd"),
+        TypeError("unsupported operand"),
+        AssertionError("mesh"),
+        StopIteration("end of file"),
+        LicenceError("none left"),
+    ],
+    ids=lambda error: type(error).__name__,
+)
+def test_a_point_that_raises_leaves_its_neighbours_alone_and_says_why(tmp_path, error):
     def picky(x):
         if np.any(x[:, 0] > 1.0):
-            raise RuntimeError("singular matrix")
+            raise error
         return two(x)
 
     state = runs.run(config(4), picky, folder=tmp_path)
@@ -174,7 +195,99 @@ def test_a_point_that_raises_leaves_its_neighbours_alone_and_says_why(tmp_path):
     assert set(state.status[bad]) == {Status.FAILED}
     line = json.loads((tmp_path / "evaluations.jsonl").read_text().splitlines()[0])
     assert set(line["messages"]) == {str(k) for k in np.flatnonzero(bad.reshape(-1))}
-    assert "RuntimeError: singular matrix" in line["messages"].values()
+    assert f"{type(error).__name__}: {error}" in line["messages"].values()
+
+
+@pytest.mark.parametrize("error", [SimulatorError("no licence"), KeyboardInterrupt()])
+def test_what_ends_the_simulator_ends_the_search(error):
+    calls = []
+
+    def ended(x):
+        calls.append(len(x))
+        raise error
+
+    with pytest.raises(type(error)):
+        runs.run(config(), ended)
+    assert calls == [8]
+
+
+def raising(x):
+    raise np.linalg.LinAlgError("singular matrix")
+
+
+def nothing(x):
+    return np.full((len(x), 2), np.nan), np.zeros(len(x), int)
+
+
+def failing(x):
+    return np.zeros((len(x), 2)), np.full(len(x), int(Status.TIMED_OUT))
+
+
+@pytest.mark.parametrize("method", ["ridge_corner", "gradient_corner", "full"])
+@pytest.mark.parametrize(
+    ("simulate", "message"),
+    [
+        (raising, "never worked; its last message: LinAlgError: singular matrix"),
+        (nothing, r"never worked; .* status -1 \(not finite output\)"),
+        (failing, r"never worked; .* status 2 \(timed out\)"),
+    ],
+)
+def test_a_simulator_that_never_works_stops_after_the_initial_design(
+    tmp_path, simulate, message, method
+):
+    for _ in range(2):
+        # The second time with what the log tells; a simulator that works by then goes on.
+        with pytest.raises(SimulatorError, match=message):
+            runs.run(config(30, method), simulate, folder=tmp_path, retries=0, identity="mine")
+    x = [np.array(r["x"]) for r in runs.storage.read_log(tmp_path)]
+    assert 8 <= sum(block[..., 0].size for block in x) < 60
+    if method == "ridge_corner":
+        state = runs.run(config(30, method), two, folder=tmp_path, identity="mine")
+        assert np.isfinite(state.y).any()
+
+
+def test_a_spent_budget_without_a_valid_point_is_an_error_every_time(tmp_path):
+    for _ in range(2):
+        with pytest.raises(SimulatorError, match=r"failed 8 times .* LinAlgError: singular"):
+            runs.run(config(4), raising, folder=tmp_path)
+
+
+def test_samples_of_ones_own_do_not_hide_a_simulator_that_never_works():
+    x = np.random.default_rng(0).uniform(-3, 3, (5, 3))
+    state = runs.start_from(config(), x, two(x)[0][:, 0])
+    with pytest.raises(SimulatorError, match="LinAlgError: singular matrix"):
+        runs.run(config(30), raising, state=state)
+
+
+def test_one_valid_point_and_declared_failures_go_on():
+    """NaN that the simulator calls a failure of a given size is a value like any other."""
+    state = runs.run(config(9), lambda x: (np.nan_to_num(nothing(x)[0], nan=1.0), nothing(x)[1]))
+    assert state.n == 9 and np.all(state.y == 1.0)
+
+    def once(x):
+        specs, status = nothing(x)
+        if len(x) == 8:
+            specs[3] = 0.5
+        return specs, status
+
+    state = runs.run(config(9), once)
+    assert state.n == 9 and np.isfinite(state.y).sum() == 1
+
+
+def test_messages_of_corners_reach_the_log(tmp_path):
+    class Netlist:
+        def __init__(self):
+            self.messages = {(1, "hot"): "no number for gain", (1, "cold"): "no number for vout"}
+
+        def __call__(self, x):
+            specs, status = two(x)
+            return specs, np.where(np.arange(len(x)) == 1, int(Status.NOT_FINITE), status)
+
+    runs.run(config(4), Netlist(), folder=tmp_path, retries=0)
+    line = json.loads((tmp_path / "evaluations.jsonl").read_text().splitlines()[0])
+    assert line["messages"] == {
+        "1": "corner hot: no number for gain; corner cold: no number for vout"
+    }
 
 
 def test_outputs_as_small_as_femtoamperes_are_searched_like_volts():
@@ -199,3 +312,58 @@ def test_identities_of_simulators():
 
     assert identity_of(Circuit().simulate) == "Circuit ldo"
     assert identity_of(two).endswith(".two")
+
+
+def scaled(x, factor=1.0, weights=None, **options):
+    specs, status = two(x)
+    return factor * specs, status
+
+
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    vdd: float
+    weights: np.ndarray
+
+
+class Technology:
+    """Something without a text of its own."""
+
+
+def test_partials_are_known_by_function_and_arguments(tmp_path):
+    hot, cold = np.arange(3.0), np.arange(3.0) + 1e-9
+    kinds = [
+        partial(scaled, factor=2.0),
+        partial(scaled, factor=2.5),
+        partial(other),
+        partial(scaled, weights=hot),
+        partial(scaled, weights=cold),
+        partial(scaled, weights=[1, "a", None, hot]),
+        partial(scaled, weights=[1, "a", None, cold]),
+        partial(scaled, weights=Setting(1.8, hot)),
+        partial(scaled, weights=Setting(1.8, cold)),
+        partial(scaled, weights=two),
+        partial(scaled, weights=other),
+        partial(scaled, weights=Technology()),
+        partial(partial(scaled, factor=2.0), weights={"a": hot}),
+        partial(partial(scaled, factor=2.0), weights={"a": cold}),
+    ]
+    names = [identity_of(kind) for kind in kinds]
+    assert len(set(names)) == len(names)
+    assert not [name for name in names if " at 0x" in name]
+    assert identity_of(partial(scaled, b=1, a=hot)) == identity_of(partial(scaled, a=hot, b=1))
+    runs.run(config(), partial(scaled, factor=2.0), folder=tmp_path)
+    runs.run(config(12), partial(scaled, factor=2.0), folder=tmp_path)
+    with pytest.raises(ValueError, match=r"simulator: '.*factor=2.0\)' -> '.*factor=3.0\)'"):
+        runs.run(config(12), partial(scaled, factor=3.0), folder=tmp_path)
+
+
+def test_no_name_is_not_the_name_of_another_simulator(tmp_path):
+    class Unnamed:
+        identity = ""
+
+        def __call__(self, x):
+            return two(x)
+
+    assert identity_of(Unnamed()).endswith("Unnamed")
+    with pytest.raises(ValueError, match="identity='': expected a name of the simulator"):
+        runs.run(config(), two, folder=tmp_path, identity="")

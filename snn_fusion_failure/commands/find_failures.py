@@ -23,6 +23,7 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.runs import (
+    WorkFailedError,
     apply_changes,
     enable_compilation_cache,
     open_run,
@@ -71,13 +72,17 @@ class Config:
     out: Path = Path("runs/find_failures")
     """Run folder."""
     resume: bool = False
-    """Go on with the run in `out`."""
+    """Go on with the run in `out`, also with a larger budget."""
     overwrite: bool = False
     """Forget the run in `out`."""
 
 
 BUDGETS = {"quick": (10, 30), "paper": (50, 300)}
 """Preset -> initial simulations, simulations in all."""
+
+
+MAY_GROW = ("n_total", "preset")
+"""Options of the budget; the search itself refuses a smaller one, or another initial design."""
 
 
 def search_of(config: Config, task: Any) -> Any:
@@ -105,6 +110,7 @@ def main(config: Config) -> dict[str, Any]:
     from failure.search.bayesopt import METHODS, SearchState, best_so_far, first_hit
     from failure.search.runs import run
     from failure.search.task import Task
+    from failure.simulators import SimulatorError
     from snn_fusion_failure.commands.own_circuit import find_circuit
     from snn_fusion_failure.records import failure_runs
 
@@ -125,7 +131,13 @@ def main(config: Config) -> dict[str, Any]:
     if config.overwrite:
         for name in ("evaluations.jsonl", "search.json", "surrogate.npz", "space.npz"):
             (config.out / name).unlink(missing_ok=True)
-    open_run(config.out, settings, resume=config.resume, overwrite=config.overwrite)
+    open_run(
+        config.out,
+        settings,
+        resume=config.resume,
+        overwrite=config.overwrite,
+        may_change=MAY_GROW,
+    )
     enable_compilation_cache()
     threshold = config.threshold
     if threshold is None:
@@ -141,14 +153,17 @@ def main(config: Config) -> dict[str, Any]:
             status = f"worst {worst:.4g} {spec.unit}, {hits}/{config.seeds} seeds failed"
             bar.update(job, completed=state.n, status=status)
 
-        state = run(
-            search,
-            circuit.simulate,
-            column,
-            sense=spec.sense,
-            folder=config.out,
-            on_step=show,
-        )
+        try:
+            state = run(
+                search,
+                circuit.simulate,
+                column,
+                sense=spec.sense,
+                folder=config.out,
+                on_step=show,
+            )
+        except SimulatorError as error:
+            raise WorkFailedError(str(error)) from error
     hits = first_hit(state.y, sign * threshold)
     worst = sign * best_so_far(state.y)[:, -1]
     failed = np.argwhere(state.y > sign * threshold)

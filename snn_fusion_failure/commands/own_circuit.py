@@ -50,7 +50,7 @@ def find_circuit(name: str, dimensions: int | None = None) -> Circuit:
 
     def simulator(x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:
         values = np.asarray([[float(function(row))] for row in x], np.float64)
-        status = np.where(np.isfinite(values[:, 0]), int(Status.GOOD), int(Status.FAILED))
+        status = np.where(np.isfinite(values[:, 0]), int(Status.GOOD), int(Status.NOT_FINITE))
         return values, status
 
     return _OwnCircuit(

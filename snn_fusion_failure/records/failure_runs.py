@@ -27,12 +27,16 @@ def describe_point(circuit: Any, x: Any) -> str:
 
 
 def threshold_for(circuit: Any, column: int, task: Any, out: Path) -> float:
-    """The threshold of this task, computed once per folder."""
+    """The threshold of this task, computed once per folder, and again where it is damaged."""
     from failure.search.thresholds import reachable
+    from failure.search.trees import set_aside
 
     path = out / "threshold.json"
     if path.exists():
-        return float(json.loads(path.read_text(encoding="utf-8"))["threshold"])
+        try:
+            return float(json.loads(path.read_bytes())["threshold"])
+        except (ValueError, KeyError, TypeError) as error:
+            set_aside(path, f"{type(error).__name__}: {error}", "computed again")
     reach = reachable(circuit.run, column, task, sense=circuit.specs[column].sense)
     write_json(path, reach._asdict())
     return reach.threshold

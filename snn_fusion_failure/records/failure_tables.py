@@ -94,9 +94,17 @@ class Config:
 
 
 def cached(path: Path, make: Any) -> Any:
-    """A JSON value that is computed once."""
+    """A JSON object that is computed once, and again where its file is damaged."""
+    from failure.search.trees import set_aside
+
     if path.exists():
-        return json.loads(path.read_text(encoding="utf-8"))
+        try:
+            held = json.loads(path.read_bytes())
+            if not held or not isinstance(held, dict):
+                raise ValueError("no values in it")
+            return held
+        except ValueError as error:
+            set_aside(path, str(error), "computed again")
     write_json(path, make())
     return json.loads(path.read_text(encoding="utf-8"))
 

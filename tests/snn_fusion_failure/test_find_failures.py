@@ -7,8 +7,10 @@ import pytest
 
 from failure import circuits
 from failure.circuits import Circuit, Spec
+from failure.search.task import Task
 from snn_fusion_failure.commands import find_failures
-from snn_fusion_failure.records import failure_tables
+from snn_fusion_failure.records import failure_runs, failure_tables
+from snn_fusion_failure.runs import WorkFailedError
 
 SLOPE = np.array([1.0, -2.0, 0.5, 3.0])
 
@@ -63,11 +65,66 @@ def test_a_folder_with_a_run_is_refused_resumed_or_replaced(config):
     find_failures.main(config)
     with pytest.raises(ValueError, match="pass --resume"):
         find_failures.main(config)
-    with pytest.raises(ValueError, match="n_total: 12 -> 13"):
-        find_failures.main(dataclasses.replace(config, n_total=13, resume=True))
+    with pytest.raises(ValueError, match="method: 'ridge_corner' -> 'monte_carlo'"):
+        find_failures.main(dataclasses.replace(config, method="monte_carlo", resume=True))
     again = find_failures.main(dataclasses.replace(config, resume=True))
     other = find_failures.main(dataclasses.replace(config, seeds=1, overwrite=True))
     assert len(again["worst_case"]) == 2 and len(other["worst_case"]) == 1
+
+
+def test_the_budget_grows_when_a_run_goes_on(config):
+    find_failures.main(config)
+    lines = (config.out / "evaluations.jsonl").read_text().splitlines()
+    found = find_failures.main(dataclasses.replace(config, n_total=14, resume=True))
+    grown = (config.out / "evaluations.jsonl").read_text().splitlines()
+    assert grown[: len(lines)] == lines and len(grown) > len(lines)
+    assert found["settings"]["n_total"] == 14
+    resumed = json.loads((config.out / "config.json").read_text())["resumed"]
+    assert [part["settings"] for part in resumed] == [{"n_total": 14}]
+    again = dataclasses.replace(config, n_total=None, preset="quick", resume=True)
+    assert find_failures.main(again)["settings"]["preset"] == "quick"
+    with pytest.raises(ValueError, match="n_total: 30 -> 12"):
+        find_failures.main(dataclasses.replace(config, resume=True))
+
+
+@pytest.mark.parametrize("broken", ["raises", "nan"])
+def test_a_function_that_never_works_is_failed_work_with_its_message(
+    config, broken, tmp_path, monkeypatch
+):
+    monkeypatch.chdir(tmp_path)
+    body = {"raises": "raise KeyError('vdd')", "nan": "return float('nan')"}[broken]
+    (tmp_path / f"circuit_{broken}.py").write_text(
+        f"def f(x):\n    with open('calls', 'a') as calls:\n        calls.write('1')\n    {body}\n"
+    )
+    own = dataclasses.replace(
+        config, circuit=f"circuit_{broken}:f", spec="value", dimensions=2, n_total=200, verify=None
+    )
+    said = {"raises": "KeyError: 'vdd'", "nan": r"status 3 \(not finite\)"}[broken]
+    with pytest.raises(WorkFailedError, match=f"never worked; its last message: .*{said}"):
+        find_failures.main(own)
+    assert len((tmp_path / "calls").read_text()) < 200
+
+
+@pytest.mark.parametrize("content", [b"", b'{"threshold": -8', b"\xe9", b"[]", b'{"nominal": 1}'])
+def test_a_damaged_threshold_is_named_and_computed_again(toy, tmp_path, content):
+    circuit, task = circuits.CIRCUITS["toy"](), Task("box", 3.0, 4)
+    path = tmp_path / "threshold.json"
+    path.write_bytes(content)
+    with pytest.warns(RuntimeWarning, match=r"threshold\.json: .*; kept as threshold\.json\.d"):
+        found = failure_runs.threshold_for(circuit, 0, task, tmp_path)
+    # 90 % of the way from 10 to 10 - 3 * 6.5
+    assert np.isclose(found, 10 - 0.9 * 3 * 6.5, atol=1e-3)
+    assert failure_runs.threshold_for(circuit, 0, task, tmp_path) == found
+    assert path.with_name("threshold.json.damaged").read_bytes() == content
+
+
+@pytest.mark.parametrize("content", [b"", b'{"threshold": -8', b"\xe9", b"[]", b"{}"], ids=repr)
+def test_a_damaged_file_of_a_study_is_named_and_computed_again(tmp_path, content):
+    path = tmp_path / "probability.json"
+    path.write_bytes(content)
+    with pytest.warns(RuntimeWarning, match=r"probability\.json: .*; kept as probability\.json\.d"):
+        assert failure_tables.cached(path, lambda: {"p": 0.5}) == {"p": 0.5}
+    assert failure_tables.cached(path, dict) == {"p": 0.5}
 
 
 @pytest.mark.parametrize(

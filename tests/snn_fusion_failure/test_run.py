@@ -86,6 +86,28 @@ def test_a_run_folder_is_claimed_once(tmp_path: Path) -> None:
         open_run(out, Settings("b", 4), resume=True)
 
 
+@pytest.mark.parametrize("content", [b"", b'{"settings": {', b"\xe9t\xe9", b"[]", b"{}"], ids=repr)
+def test_a_damaged_config_is_named_with_what_can_be_done(tmp_path: Path, content: bytes) -> None:
+    open_run(tmp_path, Settings())
+    (tmp_path / "config.json").write_bytes(content)
+    with pytest.raises(ValueError, match=r"config\.json cannot be read .*--overwrite to begin"):
+        open_run(tmp_path, Settings(), resume=True)
+    with pytest.raises(ValueError, match="pass --resume"):
+        open_run(tmp_path, Settings())
+    assert (tmp_path / "config.json").read_bytes() == content
+    open_run(tmp_path, Settings(), overwrite=True)
+    open_run(tmp_path, Settings(), resume=True)
+
+
+def test_settings_that_may_change_are_noted_where_the_run_goes_on(tmp_path: Path) -> None:
+    open_run(tmp_path, Settings())
+    open_run(tmp_path, Settings(epochs=5), resume=True, may_change=("epochs",))
+    held = json.loads((tmp_path / "config.json").read_text())
+    assert held["settings"]["epochs"] == 3 and held["resumed"][0]["settings"] == {"epochs": 5}
+    with pytest.raises(ValueError, match=r"other settings \(model: 'a' -> 'b'\)"):
+        open_run(tmp_path, Settings("b", 5), resume=True, may_change=("epochs",))
+
+
 def test_a_resumed_run_keeps_who_made_its_beginning(tmp_path, monkeypatch) -> None:
     open_run(tmp_path, Settings())
     first = json.loads((tmp_path / "config.json").read_text())

@@ -81,10 +81,6 @@ BUDGETS = {"quick": (10, 30), "paper": (50, 300)}
 """Preset -> initial simulations, simulations in all."""
 
 
-MAY_GROW = ("n_total", "preset")
-"""Options of the budget; the search itself refuses a smaller one, or another initial design."""
-
-
 def search_of(config: Config, task: Any) -> Any:
     """The search that the options ask for."""
     from failure.search.bayesopt import SearchConfig
@@ -123,21 +119,16 @@ def main(config: Config) -> dict[str, Any]:
     spec = circuit.specs[column]
     size = circuit.box if config.task == "box" else config.radius
     search = search_of(config, Task(config.task, float(size), circuit.n_dims))
-    settings = {
-        k: v
-        for k, v in dataclasses.asdict(config).items()
-        if k not in ("out", "resume", "overwrite", "verify")
-    }
+    other = ("out", "resume", "overwrite", "verify")
+    settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in other}
     if config.overwrite:
         for name in ("evaluations.jsonl", "search.json", "surrogate.npz", "space.npz"):
             (config.out / name).unlink(missing_ok=True)
+    # The search itself refuses a smaller budget and another initial design.
     open_run(
-        config.out,
-        settings,
-        resume=config.resume,
-        overwrite=config.overwrite,
-        may_change=MAY_GROW,
-    )
+        config.out, settings, resume=config.resume, overwrite=config.overwrite,
+        may_change=("n_total", "preset"),
+    )  # fmt: skip
     enable_compilation_cache()
     threshold = config.threshold
     if threshold is None:
@@ -155,13 +146,9 @@ def main(config: Config) -> dict[str, Any]:
 
         try:
             state = run(
-                search,
-                circuit.simulate,
-                column,
-                sense=spec.sense,
-                folder=config.out,
-                on_step=show,
-            )
+                search, circuit.simulate, column,
+                sense=spec.sense, folder=config.out, on_step=show,
+            )  # fmt: skip
         except SimulatorError as error:
             raise WorkFailedError(str(error)) from error
     hits = first_hit(state.y, sign * threshold)
@@ -180,9 +167,7 @@ def main(config: Config) -> dict[str, Any]:
         **provenance(),
     }
     if config.verify and len(failed):
-        specs, status = circuit.reference(state.x[failed[:, 0], failed[:, 1]])
-        again = (np.asarray(status) == 0) & (sign * np.asarray(specs)[:, column] > sign * threshold)
-        result["verified"] = {"claimed": len(failed), "confirmed": int(again.sum())}
+        result["verified"] = failure_runs.verified(circuit, column, state, sign * threshold)
     write_json(config.out / "result.json", result)
     label = METHODS[config.method].label
     point = failure_runs.pictures(

@@ -68,6 +68,16 @@ def write_failures(
             writer.writerow([seeds[row], index + 1, sign * state.y[row, index], *values])
 
 
+def verified(circuit: Any, column: int, state: Any, threshold: float) -> dict[str, int]:
+    """How many failures were claimed, and how many the circuit's reference confirms."""
+    import numpy as np
+
+    sign = 1.0 if circuit.specs[column].sense == "max" else -1.0
+    specs, status = circuit.reference(state.x[state.y > threshold])
+    again = (np.asarray(status) == 0) & (sign * np.asarray(specs)[:, column] > threshold)
+    return {"claimed": len(again), "confirmed": int(again.sum())}
+
+
 def pictures(
     out: Path, circuit: Any, column: int, state: Any, threshold: float, *, label: str, n_init: int
 ) -> Any:

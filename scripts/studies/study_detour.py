@@ -17,8 +17,8 @@ Networks use the seeds of the tables of record from 0 on. `--choose` trains on s
 training split, one after the other, and drives on maps of the validation split, which says what a
 map is worth as a teacher (`results/study_detour_choice.json`).
 
-The networks "S2_way" and "S4_way" are compared with the drivers, with the networks without
-inhibition and with each other robot by robot (`comparisons`: paired t tests, Holm's correction over
+The networks "S2_way" and "S4_way" are compared with the drivers, with the same networks under the
+additive rule and with each other robot by robot (`comparisons`: paired t tests, Holm's correction over
 all of them). Rows go to `results/study_detour.json` as each one ends; one
 that is there already with as many seeds is skipped, so the study can be broken off and gone on
 with. Drivers take seconds, Q-learning two CPU-minutes per row, a network two CPU-seconds per
@@ -62,8 +62,8 @@ PPO: dict[str, Any] = {
     "initial_std": 0.8,
 }
 PPO_PARAMS = {"learning_rate": 1e-3}
-# Robot by robot, same seeds and starts: the networks against drivers that learn nothing, with and
-# without inhibition, and the two rules against each other.
+# Robot by robot, same seeds and starts: the networks against drivers that learn nothing, the
+# multiplicative rule against the additive one, and inhibition against none.
 COMPARED = Compared(
     "sr_testing",
     (

@@ -18,11 +18,11 @@ training split, one after the other, and drives on maps of the validation split,
 map is worth as a teacher (`results/study_detour_choice.json`).
 
 The networks "S2_way" and "S4_way" are compared with the drivers, with the same networks under the
-additive rule and with each other robot by robot (`comparisons`: paired t tests, Holm's correction over
-all of them). Rows go to `results/study_detour.json` as each one ends; one
-that is there already with as many seeds is skipped, so the study can be broken off and gone on
-with. Drivers take seconds, Q-learning two CPU-minutes per row, a network two CPU-seconds per
-seed and row, with `--engine native` one.
+additive rule and with each other robot by robot (`comparisons`: paired t tests, Holm's correction
+over all of them). Rows go to `results/study_detour.json` as each one ends; one that is there
+already with as many seeds is skipped, so the study can be broken off and gone on with. Drivers take
+seconds, Q-learning two CPU-minutes per row, a network two CPU-seconds per seed and row, with
+`--engine native` one.
 """
 
 from __future__ import annotations

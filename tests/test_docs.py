@@ -69,6 +69,13 @@ def test_tutorial_runs(page: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPat
             exec(compile("\n" * line + code, str(page), "exec"), names)
 
 
+def test_a_driving_network_of_ones_own_is_forty_lines() -> None:
+    """As the page says: lines of code, without empty ones and comments."""
+    ((_, code, _),) = blocks(ROOT / "docs" / "tutorials" / "own_driving_network.md")
+    lines = [line.strip() for line in code.splitlines()]
+    assert len([line for line in lines if line and not line.startswith("#")]) <= 40
+
+
 def _missing(node: ast.ImportFrom | ast.Import) -> list[str]:
     """Names that an import of ours asks for and that are not there."""
     wanted = (

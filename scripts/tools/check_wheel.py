@@ -61,6 +61,10 @@ def simulate(x):
     return -abs(x - 2.5).sum()
 """
 
+MAP = """
+{"target": [400, 300], "starts": [[90, 300, 20]], "circles": [[250, 400, 30]]}
+"""
+
 
 @dataclasses.dataclass(frozen=True)
 class Config:
@@ -152,6 +156,7 @@ def check_commands(programs: Path, folder: Path) -> int:
     (work / "my_study.py").write_text(STUDY)
     (work / "use_it.py").write_text(SWEEP)
     (work / "my_simulator.py").write_text(SIMULATOR)
+    (work / "my.json").write_text(MAP)
     sff, python = str(programs / "sff"), str(programs / "python")
     sweep = [sff, "sweep", "--study", "my_study:trial", "--grid", "width=1,2,3", "--seeds", "4"]
     commands = [
@@ -162,6 +167,8 @@ def check_commands(programs: Path, folder: Path) -> int:
         ([sff, "train-argate", "--dataset", "simulated", "--preset", "quick"], "result: "),
         ([sff, "find-failures", "--circuit", "my_simulator:simulate", "--dimensions", "2",
           "--spec", "value", "--preset", "quick", "--threshold=-1"], "success=1"),
+        ([sff, "train-snn", "--map", "my.json", "--seeds", "1", "--max-steps", "3",
+          "--preset", "quick"], "result: "),
         *netlist_commands(sff, work),
     ]  # fmt: skip
     for command, wanted in commands:

@@ -38,6 +38,8 @@ class Difference:
 
 
 _ROBOTS = ("2.3", "2.4", "2.5")
+STUDIES = {"study_rl": dict(zip(("Scenario 1", "Scenario 2", "Scenario 3"), _ROBOTS, strict=True))}
+"""Other files of record with numbers of the source: row -> the table that prints them."""
 _CIRCUITS = ("4.1", "4.2")
 
 DIFFERENCES = (
@@ -85,10 +87,15 @@ def reason(table: str, row: Row) -> str:
 
 
 def annotated(table: str, rows: Iterable[Row]) -> list[Row]:
-    """Rows of record with the reason under `not_comparable`, where there is one."""
-    return [
-        row | {"not_comparable": why} if (why := reason(table, row)) else dict(row) for row in rows
-    ]
+    """Rows of record with the reason under `not_comparable`, where there is one.
+
+    Args:
+        table: number of the table, or the name of another file of record (`STUDIES`).
+        rows: of it.
+    """
+    tables = STUDIES.get(table, {})
+    reasons = ((row, reason(tables.get(str(row["row"]), table), row)) for row in rows)
+    return [row | {"not_comparable": why} if why else dict(row) for row, why in reasons]
 
 
 def reasons(table: str) -> list[str]:

@@ -6,7 +6,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records import cells, comparability, markdown
+from snn_fusion_failure.records import cells, comparability, markdown, robot_rows
 
 INTRODUCTION = """# Results
 
@@ -55,10 +55,12 @@ def table_section(results: Path, path: Path, source: dict[str, Any]) -> str:
     table = load(path)
     name = str(table["table"])
     rows = comparability.annotated(name, table["rows"])
+    others, whence = robot_rows.beside(results, name, rows[0]["row"])
     parts = [
         f"## Table {name}: {table['title']}",
         markdown.tally_line(rows),
-        markdown.measured(rows, source.get(name)),
+        markdown.measured([*rows, *others], source.get(name)),
+        whence,
     ]
     parts += [note for metric, note in NOTES.items() if any(r["metric"] == metric for r in rows)]
     paired = results / f"study_paired_{name.replace('.', '_')}.json"
@@ -72,7 +74,10 @@ def study_section(docs: Path, path: Path, level: str = "##") -> str:
     """Any other file of record: its rows if they have the schema, else where to find it."""
     study = load(path)
     rows = [row for row in study.get("rows", []) if {"row", "model", "metric"} <= set(row)]
+    rows = comparability.annotated(path.stem, rows)
     parts = [f"{level} {study.get('title', path.stem)}"]
+    if any("source" in row for row in rows):
+        parts.append(markdown.tally_line(rows))
     picture = docs / "images" / f"{path.stem}.png"
     if picture.exists():
         parts.append(f"![{study.get('title', path.stem)}](images/{picture.name})")

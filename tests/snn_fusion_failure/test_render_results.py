@@ -127,6 +127,54 @@ def test_no_mark_where_something_else_is_measured() -> None:
     assert "Not comparable, 2 cells: " in line and "drawings of the source's maps are lost" in line
 
 
+def test_a_study_of_the_same_cells_has_no_mark_either() -> None:
+    """Q-learning stands in a study of its own, too, with the source's numbers."""
+    section = pages.study_section(repository.ROOT / "docs", repository.RESULTS / "study_rl.json")
+    assert section.count("*not comparable*") == 9
+    assert not any(f"*{mark}*" in section for mark in ("better", "within", "worse"))
+    assert "Not comparable, 9 cells: the source gives neither the rewards of its Q-learn" in section
+
+
+def test_tables_of_robots_have_drivers_ppo_and_the_shortest_path_beside_them(
+    tmp_path: Path,
+) -> None:
+    def robot(row: str, model: str, values: list[float], metric: str = "sr_testing") -> Any:
+        return _row(row, model, values, metric=metric)
+
+    files = {
+        "table_2_4": [robot("Scenario 2: here", "S4", [90.0, 92.0]) | {"source": 90}],
+        "study_detour": [
+            robot("Scenario 1", "blind", [1.0, 3.0]),
+            robot("Scenario 2", "blind", [4.0, 6.0]),
+            robot("Scenario 2", "reflex_100", [7.0, 9.0]),
+            robot("Scenario 2", "S4", [20.0, 30.0]),
+        ],
+        "study_rl": [
+            robot("Scenario 2", "PPO", [98.0, 99.0]) | {"source": 1},
+            robot("Scenario 2", "PPO", [40.0, 42.0], "trials_to_90"),
+        ],
+        "study_families": [robot("Scenario 2", "planner", [377.0], "path_shortest")],
+    }
+    for name, rows in files.items():
+        write_json(tmp_path / f"{name}.json", MADE | {"table": "2.4", "title": "T", "rows": rows})
+    section = pages.table_section(tmp_path, tmp_path / "table_2_4.json", {})
+    assert _line(section, "| model |") == "| model | sr_testing | path |"
+    assert "**5.00**" in _line(section, "| blind |") and "**8.00**" in _line(
+        section, "reflex 100 |"
+    )
+    assert "**98.50**" in _line(section, "| PPO |") and "source" not in _line(section, "| PPO |")
+    assert "**91.00**" in _line(section, "| S4 |")  # of the table, not of the study
+    assert _line(section, "| shortest path |") == "| shortest path |  | **377.00** % (1) |"
+    assert (
+        "On the same map: blind, reflex 100 from `results/study_detour.json`; PPO from "
+        "`results/study_rl.json`; shortest path from `results/study_families.json`."
+    ) in section
+    assert "Not comparable, 1 cells" in section
+    other = MADE | {"table": "3.1", "title": "T", "rows": files["table_2_4"]}
+    write_json(tmp_path / "table_3_1.json", other)
+    assert "blind" not in pages.table_section(tmp_path, tmp_path / "table_3_1.json", {})
+
+
 def test_intervals_of_shares_stay_inside() -> None:
     """Student's interval of these success rates ends at 102 %."""
     row = {"metric": "sr_testing", "unit": "%", "values": [100.0] * 7 + [90.0]}

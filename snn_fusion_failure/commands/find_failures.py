@@ -122,7 +122,8 @@ def main(config: Config) -> dict[str, Any]:
     other = ("out", "resume", "overwrite", "verify")
     settings = {k: v for k, v in dataclasses.asdict(config).items() if k not in other}
     if config.overwrite:
-        for name in ("evaluations.jsonl", "search.json", "surrogate.npz", "space.npz"):
+        held = ("evaluations.jsonl", "search.json", "surrogate.npz", "space.npz", "threshold.json")
+        for name in held:
             (config.out / name).unlink(missing_ok=True)
     # The search itself refuses a smaller budget and another initial design.
     open_run(

@@ -68,7 +68,9 @@ def test_a_folder_with_a_run_is_refused_resumed_or_replaced(config):
     with pytest.raises(ValueError, match="method: 'ridge_corner' -> 'monte_carlo'"):
         find_failures.main(dataclasses.replace(config, method="monte_carlo", resume=True))
     again = find_failures.main(dataclasses.replace(config, resume=True))
+    (config.out / "threshold.json").write_text('{"threshold": 99.0}')  # of what was searched before
     other = find_failures.main(dataclasses.replace(config, seeds=1, overwrite=True))
+    assert not (config.out / "threshold.json").exists()
     assert len(again["worst_case"]) == 2 and len(other["worst_case"]) == 1
 
 

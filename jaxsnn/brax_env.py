@@ -28,7 +28,7 @@ from brax.envs.wrappers.training import (
 from jaxtyping import Array
 
 from jaxsnn import navigation, world
-from jaxsnn._checks import require
+from jaxsnn._checks import require, typed_key
 from jaxsnn.maps import stack_maps
 
 
@@ -41,13 +41,6 @@ class PipelineState(NamedTuple):
 
     robot: world.WorldState  # its key replaced by words [2] uint32
     params: world.WorldParams
-
-
-def _typed(key: Array) -> Array:
-    """A typed key from either kind: brax hands out raw uint32 words."""
-    if jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
-        return key
-    return jax.random.wrap_key_data(key)
 
 
 def _pack(robot: world.WorldState) -> world.WorldState:
@@ -83,7 +76,7 @@ class NavigationEnv(Env):
 
     def reset(self, rng: jax.Array) -> State:
         """A robot in a start circle; `rng` may be a raw or a typed key."""
-        robot, obs = navigation.start_robot(self.params, key=_typed(rng))
+        robot, obs = navigation.start_robot(self.params, key=typed_key(rng))
         zero = jnp.zeros((), jnp.float32)
         return State(
             pipeline_state=PipelineState(_pack(robot), self.params),
@@ -150,7 +143,7 @@ class FreshResetWrapper(Wrapper):
             steps = jnp.where(over, jnp.zeros_like(state.info["steps"]), state.info["steps"])
             state.info.update(steps=steps)
         state = self.env.step(state.replace(done=jnp.zeros_like(state.done)), action)
-        split = jax.vmap(lambda k: jax.random.key_data(jax.random.split(_typed(k))))
+        split = jax.vmap(lambda k: jax.random.key_data(jax.random.split(typed_key(k))))
         words = split(state.info["reset_rng"])
         fresh = self.env.reset(words[:, 0])
         done = state.done.astype(bool)
@@ -203,7 +196,7 @@ def map_randomization(
         )
 
     def draw(key: Array) -> world.WorldParams:
-        first, *others = jax.random.split(_typed(key), 1 + len(ranges))
+        first, *others = jax.random.split(typed_key(key), 1 + len(ranges))
         which = jax.random.randint(first, (), 0, len(maps))
         drawn = {
             name: jax.random.uniform(one, (), minval=low, maxval=high)

@@ -53,7 +53,8 @@ class NetworkConfig:
         critic: "td": a step's reward is its temporal-difference error (`jaxsnn.critic`).
         credit, shaping: who gets that error, and the potential of a step's reward (`critic`).
         mirror: tie the two halves of the network (`jaxsnn.mirror`).
-        n_sonars: of the map's robot, an odd number (`make_map(sonar_angles=...)`).
+        n_sonars: of the map's robot (`make_map(sonar_angles=...)`), odd and at least 3. The edges
+            of the intervals and the two motors are fixed; the table of Q-learning has five sonars.
         starts: of learning trials, the map's "circles" or "anywhere" (`ways.training_map`).
         engine: what computes a window, "xla" or "native" (`jaxsnn.native`).
 
@@ -87,18 +88,17 @@ class NetworkConfig:
 
     def __post_init__(self) -> None:
         """Refuse sizes and choices that make no network."""
-        for name in ("hidden_exc", "hidden_inh"):
+        for name in ("hidden_exc", "hidden_inh", "group_exc", "group_inh"):
             n = getattr(self, name)
             require_whole(name, n, 0, "give 0 for none")
-            require(n % 2 == 0, f"{name}={n}: expected an even number; it has two halves")
+            even = n % 2 == 0 or name.startswith("group")
+            require(even, f"{name}={n}: expected an even number; it has two halves")
         require(
             self.n_hidden > 0, "hidden_exc=0, hidden_inh=0: expected a hidden neuron; raise one"
         )
-        for name in ("group_exc", "group_inh"):
-            n = getattr(self, name)
-            require_whole(name, n, 0, "give 0 for none")
         require(self.n_in > 0, "group_exc=0, group_inh=0: expected an input neuron; raise one")
-        odd = self.n_sonars >= 3 and self.n_sonars % 2 == 1
+        require_whole("n_sonars", self.n_sonars, 3, "give an odd number, 3 or more")
+        odd = self.n_sonars % 2 == 1
         require(odd, f"n_sonars={self.n_sonars}: expected an odd number, 3 or more; add one")
         require_positive("dt", self.dt, "give the step in seconds, 1e-3 for one millisecond")
         for name in ("control_steps", "hold_steps"):

@@ -98,7 +98,12 @@ def drive_fixed(
     n_trials: int,
     max_steps: int,
 ) -> TrialResult:
-    """Drive robots by an agent of `fixed_agent` over a map: TrialResult, `[robots, trials]`."""
+    """Drive robots by an agent of `fixed_agent` over a map: TrialResult, `[robots, trials]`.
+
+    Raises:
+        ValueError, TypeError: keys, trials or steps are not what `run_phase` takes.
+    """
+    require_keys(keys)
     states = jnp.zeros(keys.shape[0])
     _, result = run_phase(
         agent, params, map, states, keys=keys, n_trials=n_trials, max_steps=max_steps
@@ -119,6 +124,9 @@ def drive(
 
     Returns:
         TrialResult, leaves `[robots, trials]`.
+
+    Raises:
+        ValueError, TypeError: keys, trials or steps are not what `run_phase` takes.
 
     Example:
         >>> from jaxsnn import scenario, success_rate

@@ -6,7 +6,7 @@ the angle to the target. Each reading falls into an interval, each interval has 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import Literal, NamedTuple
 
 import jax
@@ -94,15 +94,16 @@ def rate_table(
 
 
 def check_rates(rates: RateTable | Float[Array, "..."], *, dt: float) -> None:
-    """Refuse rates that are NaN, negative, or above one spike per step.
+    """Refuse rates that are NaN, negative, or above one spike per step, and a step of no length.
 
     Raises:
-        ValueError: names the rate and the fix.
+        ValueError: names the rate or the step, and the fix.
     """
+    require_positive("dt", dt, "give the step in seconds, 1e-3 for one millisecond")
     for leaf in jax.tree.leaves(rates):
         require_positive("rates", leaf, "give firing rates in Hz", zero=True)
         numbers = concrete(leaf)
-        if numbers is not None:
+        if numbers is not None and numbers.size:
             require(
                 bool(numbers.max() * dt <= 1.0),
                 f"rates={numbers.max()}: expected at most one spike per step, {1 / dt:g} Hz with "
@@ -169,7 +170,7 @@ def interval_rates(
 
 
 def poisson_spikes(
-    rates: Float[Array, " n"], n_steps: int, *, dt: float, key: Key[Array, ""]
+    rates: Float[Array, " n"] | Sequence[float], n_steps: int, *, dt: float, key: Key[Array, ""]
 ) -> Float[Array, "t n"]:
     r"""Independent Poisson (Bernoulli per step) spike trains, 0. or 1.
 
@@ -188,7 +189,8 @@ def poisson_spikes(
         Spikes, `[n_steps, n]`, of the dtype of `rates`.
 
     Raises:
-        ValueError: a rate is NaN, negative or above one spike per step; a legacy key.
+        ValueError: a rate is NaN, negative or above one spike per step, or rates are not along one
+            axis; `dt` is not positive; a legacy key.
 
     Example:
         >>> rates, key = jnp.array([0.0, 1000.0]), jax.random.key(0)
@@ -197,6 +199,11 @@ def poisson_spikes(
     """
     require_key(key)
     require_whole("n_steps", n_steps, 1, "ask for at least one step")
+    rates = jnp.asarray(rates)
+    require(
+        rates.ndim == 1,
+        f"rates=<shape {rates.shape}>: expected [n], one rate per neuron; use jnp.full or vmap",
+    )
     check_rates(rates, dt=dt)
     n = rates.shape[0]
     half = (n + 1) // 2

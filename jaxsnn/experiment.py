@@ -16,12 +16,12 @@ import numpy as np
 from jaxtyping import Array, Int, Key
 
 from jaxsnn import network, planner, world
-from jaxsnn._checks import require, require_keys, require_whole
+from jaxsnn._checks import require, require_keys, require_mapped, require_whole
 from jaxsnn.agents import Agent, RewardFunction, snn_agent, snn_params
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights
 from jaxsnn.network import NetworkState
 from jaxsnn.phases import run_phases
-from jaxsnn.trials import TrialResult, check_circles, run_phase, start_states
+from jaxsnn.trials import TrialResult, given_circles, run_phase, start_states
 
 TEST_TRIALS = {1: 30, 2: 20, 3: 20}
 """Testing trials of each scenario in the source (section 2.5)."""
@@ -35,7 +35,8 @@ def seed_keys(seeds: Int[Array, " n"] | Sequence[int]) -> Key[Array, " n"]:
 
 def learning_circles(scenario: int, n_learn: int) -> Int[Array, " trials"] | None:
     """Start circles of the learning trials: Scenario 2's in turn, as the source; None is random."""
-    return jnp.arange(n_learn) % 2 if scenario == 2 else None
+    require_whole("n_learn", n_learn, 0, "give 0 for none")
+    return jnp.arange(n_learn, dtype=jnp.int32) % 2 if scenario == 2 else None
 
 
 def phase_keys(robot_key: Key[Array, ""]) -> Key[Array, " 4"]:
@@ -63,7 +64,7 @@ def run_experiment(
     n_online: int = 0,
     max_steps: int = 200,
     block: int = 8,
-    circles: Int[Array, " trials"] | None = None,
+    circles: Int[Array, " trials"] | Sequence[int] | None = None,
     weights: Weights | None = None,
     states: Any = None,
     params_axis: Any = None,
@@ -81,16 +82,17 @@ def run_experiment(
         params: SNNParams, or what `agents` take.
         map: the map to learn on.
         keys: one per robot (an independent run each).
-        n_learn, n_test: trials of the two phases; weights are frozen in testing.
+        n_learn, n_test: trials of the two phases; weights are frozen in testing. With 0 a phase
+            is left out: its results have no trials, and a rate of them is NaN.
         n_online: testing trials with plasticity left on, a second reading of the source.
         max_steps: control steps after which a trial is given up.
         block: robots that run together; see the module's docstring.
-        circles: start circle of each learning trial; drawn at random when not given.
+        circles: start circle of each learning trial; drawn at random when not given or negative.
         weights: first weights, leaves `[robots, ...]`; drawn at random when not given.
         states: networks to go on with, leaves `[robots, ...]`, from `saved.load_networks` or an
             earlier experiment; instead of `weights`.
         params_axis, map_axis: 0 when each robot has its own, a tree for some leaves only, as in
-            `jax.vmap`.
+            `jax.vmap`; no other axis.
         test_map: the map to test on; `map` when not given. Shares `map_axis`.
         record: keep the poses.
         keep_states: return the networks after learning (0.4 MB per robot).
@@ -102,13 +104,20 @@ def run_experiment(
         Experiment; leaves lead with robots.
 
     Raises:
-        ValueError: there is no robot, no trial or no step, or `block` is not positive; keys,
-            circles or weights do not fit.
+        ValueError, TypeError: there is no robot, no trial in any phase or no step, or `block` is
+            not positive; keys, circles, weights, states or what each robot has for itself do not
+            fit.
     """
     require_keys(keys)
+    for name, count in (("n_learn", n_learn), ("n_test", n_test)):
+        require_whole(name, count, 0, "give 0 to leave the phase out")
     require_whole("block", block, 1, "run at least one robot per block")
     require_whole("n_online", n_online, 0, "give 0 for none")
-    check_circles(map, circles, n_learn)
+    require(
+        n_learn + n_test + n_online > 0,
+        "n_learn=0, n_test=0, n_online=0: expected a trial in one of them; raise one",
+    )
+    circles = given_circles(map, circles, n_learn)
     robots = keys.shape[0]
     require(
         agents is None or (reward is None and weights is None),
@@ -128,6 +137,12 @@ def run_experiment(
             network.check_weights(config, params.network, given, robots)
         agents = snn_agent(config, reward=reward), snn_agent(config, plastic=False)
     learner, frozen = agents
+    tested_on = map if test_map is None else test_map
+    require_mapped("weights", 0, weights, robots)
+    require_mapped("states", 0, states, robots)
+    require_mapped("params", params_axis, params, robots)
+    require_mapped("map", map_axis, map, robots)
+    require_mapped("test_map", map_axis, tested_on, robots)
 
     def run(
         robot_keys: Array, weights: Any, states: Any, params: Any, map: Any, test_map: Any
@@ -148,27 +163,28 @@ def run_experiment(
             )  # fmt: skip
             online = phases[2] if n_online else None
             return Experiment(phases[0], phases[1], online, states if keep_states else None)
-        states, learning = run_phase(
-            learner, params, map, states, keys=split[:, 1],
-            n_trials=n_learn, circles=circles, record=record, **axes,
-        )  # fmt: skip
-        _, testing = run_phase(
-            frozen, params, test_map, states, keys=split[:, 2],
-            n_trials=n_test, record=record, **axes,
-        )  # fmt: skip
+
+        def phase(
+            number: int, agent: Agent, map: Any, states: Any, n: int, circles: Any = None
+        ) -> tuple[Any, TrialResult]:
+            after, result = run_phase(
+                agent, params, map, states, keys=split[:, number], n_trials=max(n, 1),
+                run=None if n else 0, circles=circles if n else None, record=record, **axes,
+            )  # fmt: skip
+            return after, result if n else jax.tree.map(lambda x: x[:, :0], result)
+
+        states, learning = phase(1, learner, map, states, n_learn, circles)
+        _, testing = phase(2, frozen, test_map, states, n_test)
         online = None
         if n_online:
-            _, online = run_phase(
-                learner, params, test_map, states, keys=split[:, 3],
-                n_trials=n_online, record=record, **axes,
-            )  # fmt: skip
+            _, online = phase(3, learner, test_map, states, n_online)
         return Experiment(learning, testing, online, states if keep_states else None)
 
     block = min(block, robots)
     n_blocks = -(-robots // block)
     # The last block is filled up with robots from the front, which are dropped again.
     order = jnp.arange(n_blocks * block) % robots
-    trees = (keys, weights, states, params, map, map if test_map is None else test_map)
+    trees = (keys, weights, states, params, map, tested_on)
     leaves, form = jax.tree.flatten(trees)
     own = _mapped((0, 0, 0, params_axis, map_axis, map_axis), trees)
     cut = [
@@ -204,7 +220,7 @@ def make_runner(
     n_online: int = 0,
     max_steps: int = 200,
     block: int = 8,
-    circles: Int[Array, " trials"] | None = None,
+    circles: Int[Array, " trials"] | Sequence[int] | None = None,
     test_map: world.WorldParams | None = None,
     record: bool = False,
     keep_states: bool = False,
@@ -252,6 +268,7 @@ def shortest_paths(map: world.WorldParams, seeds: Sequence[int], n_test: int) ->
         )
         return jnp.stack([found.x, found.y], axis=-1)
 
+    require_whole("n_test", n_test, 1, "ask for at least one testing start")
     field = planner.path_field(map)
     positions = np.asarray(starts(jnp.asarray(seeds, jnp.int32)), np.float64)
     return np.stack([field.lengths(p) for p in positions])

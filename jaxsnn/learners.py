@@ -15,6 +15,7 @@ import numpy as np
 from jaxtyping import Array, Key
 
 from jaxsnn import navigation, planner, ppo, qlearning, world
+from jaxsnn._checks import require, require_key, require_keys, require_whole
 from jaxsnn.way import WayLength
 
 # Greedy tests of the Q-learner after so many training trials, each a multiple of the chunk before
@@ -68,7 +69,13 @@ def train_qlearning(
 
     Returns:
         metric -> one value for each learner.
+
+    Raises:
+        ValueError, TypeError: `key` is not one typed key, or there is no learner or trial.
     """
+    require_key(key)
+    for name, count in (("learners", learners), ("n_train", n_train), ("n_test", n_test)):
+        require_whole(name, count, 1, "ask for at least one")
     params = qlearning.QParams(*(jnp.asarray(v, jnp.float32) for v in params))
     greedy = params._replace(epsilon=jnp.float32(test_epsilon))
     seeds = jnp.arange(learners)
@@ -141,6 +148,7 @@ def ppo_policies(
     max_steps: int = 200,
 ) -> ppo.Result:
     """Train one policy per key on a map; with `way` the reward counts progress along the way."""
+    require_keys(keys)
     env = navigation.navigation_env(map, max_steps=max_steps, way=way)
     train = ppo.make_train(config, env)
     return jax.vmap(lambda k: train(params, key=k))(keys)
@@ -156,6 +164,10 @@ def drive_policies(
     max_steps: int = 200,
 ) -> qlearning.Trials:
     """Trials without exploration of trained policies `[n, ...]`, leaves `[n, trials]`."""
+    shape = jnp.shape(keys)
+    require(
+        len(shape) == 2, f"keys=<shape {shape}>: expected [policies, trials]; split each one's key"
+    )
     env = navigation.navigation_env(map, max_steps=max_steps)
 
     def one(weights: Any, keys: Array) -> qlearning.Trials:
@@ -178,7 +190,12 @@ def train_ppo(
 
     Returns:
         metric -> one value for each learner.
+
+    Raises:
+        ValueError, TypeError: keys are not typed keys along one axis, or there is no trial.
     """
+    require_keys(keys)
+    require_whole("n_test", n_test, 1, "ask for at least one trial")
     program = _ppo_program(config, n_test, max_steps)
     params = jax.tree.map(jnp.float32, params)
     metrics, states, success = jax.tree.map(

@@ -1,17 +1,20 @@
 """The robot world as an environment for reinforcement learning: observation, action, reward.
 
-`start_robot` and `drive_robot` are one robot's episode; `navigation_env` and `brax_env` wrap them.
+`start_robot` and `drive_robot` are one robot's episode; `navigation_env` and `brax_env` wrap them,
+and `gymnax_pair` has the signatures of gymnax.
 """
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from collections.abc import Callable
+from typing import Any, NamedTuple
 
+import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float, Key
 
 from jaxsnn import world
-from jaxsnn._checks import require_whole
+from jaxsnn._checks import require_whole, typed_key
 from jaxsnn.ppo_config import Env, Transition
 from jaxsnn.way import WayLength, remaining_way
 
@@ -135,3 +138,67 @@ def navigation_env(
         )
 
     return Env(reset, step, action_size=1)
+
+
+class GymnaxPair(NamedTuple):
+    """The two functions that learners written for gymnax call; both are pure.
+
+    Attributes:
+        reset: `(key, params) -> (obs, state)`.
+        step: `(key, state, action, params) -> (obs, state, reward, done, info)`.
+    """
+
+    reset: Callable[..., tuple[Array, Any]]
+    step: Callable[..., tuple[Array, Any, Array, Array, dict[str, Array]]]
+
+
+def gymnax_pair(*, max_steps: int = 200, way: WayLength | None = None) -> GymnaxPair:
+    """The robot world as gymnax has its environments (gymnax itself is not needed).
+
+    `params` of the two functions is the map, so that jit and vmap go over maps as well. `step`
+    begins the next episode by itself: after an end, `obs` and `state` are those of a fresh start
+    from `key`, while `reward`, `done` and `info` are of the step that ended. `info` says whether
+    the robot has `arrived`, whether the limit of steps `truncated` the episode, and `discount`, 0
+    after arrival or collision alone, so that a learner may look beyond the limit. Keys may be raw,
+    as most of these learners have them.
+
+    Args:
+        max_steps, way: as for `navigation_env`.
+
+    Raises:
+        ValueError, TypeError: `max_steps` is no whole number above 0.
+
+    Example:
+        >>> from jaxsnn import scenario
+        >>> env, key = gymnax_pair(max_steps=50), jax.random.key(0)
+        >>> obs, state = env.reset(key, scenario(1))
+        >>> obs, state, reward, done, info = env.step(key, state, jnp.zeros(1), scenario(1))
+        >>> obs.shape, bool(done), float(info["discount"])
+        ((8,), False, 1.0)
+    """
+    require_whole("max_steps", max_steps, 1, "allow at least one control step")
+
+    def reset(key: Array, params: world.WorldParams) -> tuple[Array, _Navigation]:
+        state, obs = navigation_env(params, max_steps=max_steps, way=way).reset(typed_key(key))
+        return obs, state
+
+    def step(
+        key: Array,
+        state: _Navigation,
+        action: Float[Array, "1"],
+        params: world.WorldParams,
+    ) -> tuple[Array, _Navigation, Array, Array, dict[str, Array]]:
+        made = navigation_env(params, max_steps=max_steps, way=way).step(state, action)
+        done = made.terminated | made.truncated
+        obs, after = jax.tree.map(
+            lambda fresh, old: jnp.where(done, fresh, old),
+            reset(key, params), (made.obs, made.state),
+        )  # fmt: skip
+        info = {
+            "arrived": made.success,
+            "truncated": made.truncated,
+            "discount": 1.0 - made.terminated.astype(made.reward.dtype),
+        }
+        return obs, after, made.reward, done, info
+
+    return GymnaxPair(reset, step)

@@ -6,10 +6,11 @@ gives them), so that a weight is the jump of the membrane potential that one spi
 
 from __future__ import annotations
 
-from typing import NamedTuple
+from typing import Any, NamedTuple
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float
 
 from jaxsnn._checks import (
@@ -86,6 +87,16 @@ def check_lif(params: LIFParams, *, dt: float) -> None:
         )
 
 
+def _fits(name: str, value: Any, shape: tuple[int, ...], fix: str) -> None:
+    """`value` broadcasts to `[*batch, n]` without widening it: shapes are known inside jit, too."""
+    given, n = jnp.shape(value), shape[-1]
+    try:
+        fits = np.broadcast_shapes(given, shape)[-1] == n
+    except ValueError:
+        fits = False
+    require(fits, f"{name}=<shape {given}>: expected a number or {n} of them; {fix}")
+
+
 def lif_init(params: LIFParams, n: int) -> LIFState:
     """`n` neurons at rest, none of them refractory, in jax's default float (float64 under x64).
 
@@ -93,9 +104,11 @@ def lif_init(params: LIFParams, n: int) -> LIFState:
         LIFState, leaves `[n]`.
 
     Raises:
-        ValueError: `params` holds a constant that no neuron has, or `n` is not positive.
+        ValueError: `params` holds a constant that no neuron has, or not one for each neuron; `n`
+            is not positive.
     """
     require_whole("n", n, 1, "a layer needs at least one neuron")
+    _fits("v_rest", params.v_rest, (n,), "give one for all neurons, or one for each")
     dtype = default_float()
     v = jnp.full((n,), 1.0, dtype) * jnp.asarray(params.v_rest, dtype)
     return LIFState(v=v, refractory=jnp.zeros((n,), dtype))
@@ -129,7 +142,8 @@ def lif_step(
         The new state, of the dtype of the old one, and the spikes of this step, `[n]` bool.
 
     Raises:
-        ValueError: a constant with which the step cannot work, see `check_lif`.
+        ValueError: a constant with which the step cannot work, see `check_lif`, or a constant,
+            current or jump for another number of neurons than the state has.
 
     Source: Shim (2020), Eq. 2.1; order of operations as in Brian 2 with `(unless refractory)`.
 
@@ -141,6 +155,10 @@ def lif_step(
         [False, True]
     """
     check_lif(params, dt=dt)
+    for name, value in params._asdict().items():
+        _fits(name, value, state.v.shape, "give one for all neurons, or one for each")
+    _fits("current", current, state.v.shape, "give one for all neurons, or one for each")
+    _fits("jump", jump, state.v.shape, "sum the weights of each neuron's spikes")
     left = jnp.maximum(state.refractory - dt, 0.0)
     # Half a step of slack: what is left is a multiple of dt only up to rounding.
     active = left <= 0.5 * dt
@@ -162,7 +180,15 @@ def lif_scan(
 
     Returns:
         The last state, spikes `[t, n]` and potentials before the reset `[t, n]` [mV].
+
+    Raises:
+        ValueError: `jumps` are not steps of as many neurons as the state has; as `lif_step`.
     """
+    shape = jnp.shape(jumps)
+    require(
+        len(shape) > 1 and shape[-1] == state.v.shape[-1],
+        f"jumps=<shape {shape}>: expected (steps, {state.v.shape[-1]}); give a row for each step",
+    )
 
     def body(carry: LIFState, jump: Array) -> tuple[LIFState, tuple[Array, Array]]:
         carry, spikes = lif_step(params, carry, 0.0, jump, dt=dt)

@@ -79,6 +79,26 @@ def check_stdp(params: STDPParams, *, dt: float) -> None:
         require_finite(name, getattr(params, name), "give it in millivolts")
 
 
+def check_spikes(state: STDPState, pre: Array, post: Array, *, lead: int = 0) -> None:
+    """Refuse spikes of other layers than the state's; shapes are known inside jit, too.
+
+    Args:
+        state: STDPState.
+        pre, post: spikes, `[n_pre]` and `[n_post]` behind `lead` axes.
+        lead: 1 where steps come first.
+
+    Raises:
+        ValueError: names the spikes, their shape and that of the state.
+    """
+    for name, spikes, trace in zip(("pre", "post"), (pre, post), state.traces, strict=True):
+        shape, n = jnp.shape(spikes), jnp.shape(trace)[-1]
+        require(
+            len(shape) == lead + 1 and shape[-1] == n,
+            f"{name}=<shape {shape}>: expected ({'steps, ' * lead}{n}{'' if lead else ','}), as "
+            "the state has; make it by stdp_init(n_pre, n_post) for these layers",
+        )
+
+
 def check_bounds(
     weights: Float[Array, "..."], w_min: float | Array, w_max: float | Array, name: str = "weights"
 ) -> None:
@@ -147,7 +167,8 @@ def stdp_step(
         The new STDPState, of the dtype of the old one.
 
     Raises:
-        ValueError: a constant with which the step cannot work, see `check_stdp`.
+        ValueError: a constant with which the step cannot work, see `check_stdp`, or spikes of other
+            layers than the state's.
 
     Source: Shim (2020), Eq. 2.4-2.7, after Florian (2007).
 
@@ -158,6 +179,7 @@ def stdp_step(
         True
     """
     check_stdp(params, dt=dt)
+    check_spikes(state, pre, post)
     a_minus = params.a_minus * params.anti_causal
     p_plus = jnp.exp(-dt / params.tau_plus) * state.traces.p_plus + params.a_plus * pre
     p_minus = jnp.exp(-dt / params.tau_minus) * state.traces.p_minus + a_minus * post
@@ -206,7 +228,8 @@ def apply_reward(
         The new weights.
 
     Raises:
-        ValueError: an unknown rule or kind of bounds, or `w_min` above `w_max`.
+        ValueError: an unknown rule or kind of bounds, `w_min` above `w_max`, or a drive of another
+            shape than the weights.
 
     Source: Shim (2020), Eq. 2.3 and 2.8. Soft bounds are ours.
 
@@ -217,6 +240,8 @@ def apply_reward(
     """
     require_choice("rule", rule, ("additive", "multiplicative"))
     require_choice("bounds", bounds, ("hard", "soft"))
+    shape, given = jnp.shape(weights), jnp.shape(drive)
+    require(given == shape, f"drive=<shape {given}>: expected {shape}; give one for each weight")
     low, high = concrete(w_min), concrete(w_max)
     if low is not None and high is not None:
         require(

@@ -18,6 +18,7 @@ from jaxsnn import sensor_intervals, world
 from jaxsnn._checks import (
     concrete,
     require,
+    require_count,
     require_finite,
     require_keys,
     require_whole,
@@ -184,14 +185,15 @@ def run_trials(
         (tables, Trials).
 
     Raises:
-        ValueError: `n_trials` or `max_steps` is below 1, a constant is out of range, or the keys
-            are not one typed key per table.
+        ValueError, TypeError: `n_trials`, `max_steps` or `first_trial` is no such number, a
+            constant is out of range, or the keys are not one typed key per table.
 
     Source: Shim & Li (2017), section 2.4.3 (actions, epsilon). Its rewards for Q-learning, learning
     rate and discount are not given: arrival and collision are rewarded as in section 2.2.2.1.
     """
     require_whole("n_trials", n_trials, 1, "ask for at least one trial")
     require_whole("max_steps", max_steps, 1, "allow at least one control step")
+    require_count("first_trial", first_trial, 0, "count trials from 0")
     check_q(params)
     require_keys(keys)
     n = tables.shape[0]

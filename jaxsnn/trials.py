@@ -9,6 +9,7 @@ takes all robots.
 from __future__ import annotations
 
 import functools
+from collections.abc import Sequence
 from typing import Any, NamedTuple
 
 import jax
@@ -17,7 +18,17 @@ import numpy as np
 from jaxtyping import Array, Float, Int, Key
 
 from jaxsnn import world
-from jaxsnn._checks import concrete, default_float, require, require_keys, require_whole
+from jaxsnn._checks import (
+    concrete,
+    default_float,
+    require,
+    require_circles,
+    require_count,
+    require_key,
+    require_keys,
+    require_mapped,
+    require_whole,
+)
 from jaxsnn.agents import Agent
 from jaxsnn.status import Status
 
@@ -154,7 +165,7 @@ def _starts(
 
 def start_states(
     map: world.WorldParams,
-    circles: Int[Array, " trials"] | None = None,
+    circles: Int[Array, " trials"] | Sequence[int] | None = None,
     *,
     key: Key[Array, ""],
     n_trials: int,
@@ -163,32 +174,33 @@ def start_states(
 
     Returns:
         world.WorldState with leaves `[trials]`.
-    """
-    return _starts(map, circles, key, n_trials, 0).robot
-
-
-def check_circles(map: world.WorldParams, circles: Array | None, n_trials: int) -> None:
-    """Refuse start circles that are not one existing circle of the map for each trial.
 
     Raises:
-        ValueError: too few or too many of them, or one that the map does not draw from.
+        ValueError, TypeError: as `run_phase`, of the same arguments.
+    """
+    require_key(key)
+    require_whole("n_trials", n_trials, 1, "ask for at least one trial")
+    return _starts(map, given_circles(map, circles, n_trials), key, n_trials, 0).robot
+
+
+def given_circles(
+    map: world.WorldParams, circles: Int[Array, " n"] | Sequence[int] | None, n_trials: int
+) -> Int[Array, " trials"] | None:
+    """Start circles of trials as an array, one for each, an existing one or negative for a draw.
+
+    Raises:
+        ValueError, TypeError: too few or too many of them, one that the map does not draw from,
+            or no whole numbers.
     """
     if circles is None:
-        return
+        return None
+    shape = np.shape(circles)
     require(
-        circles.shape == (n_trials,),
-        f"circles=<shape {circles.shape}>: expected ({n_trials},); give one start circle per trial",
+        shape == (n_trials,),
+        f"circles=<shape {shape}>: expected ({n_trials},); give one start circle per trial",
     )
-    given, probs = concrete(circles), concrete(map.start_probs)
-    if given is None or probs is None:
-        return
-    known = np.flatnonzero(np.atleast_2d(probs).max(axis=0) > 0)
-    wrong = given[~np.isin(given, known)]
-    require(
-        not wrong.size,
-        f"circles={wrong[:1].tolist()}: expected numbers of start circles of the map, "
-        f"{known.tolist()}; count from 0",
-    )
+    require_circles("circles", circles, map.start_probs)
+    return jnp.asarray(circles, jnp.int32)
 
 
 def run_phase(
@@ -200,7 +212,7 @@ def run_phase(
     keys: Key[Array, " robots"],
     n_trials: int,
     max_steps: int,
-    circles: Int[Array, " trials"] | None = None,
+    circles: Int[Array, " trials"] | Sequence[int] | None = None,
     first: int = 0,
     run: int | Int[Array, ""] | None = None,
     params_axis: Any = None,
@@ -226,22 +238,33 @@ def run_phase(
         first: number of the first trial: a phase in two parts, the second one from the states and
             the number at which the first one ended, is the phase in one.
         params_axis, map_axis: 0 when each robot has its own, a tree for some leaves only, as in
-            `jax.vmap`.
+            `jax.vmap`; no other axis.
         record: keep the poses.
 
     Returns:
         The agents' states and a TrialResult.
 
     Raises:
-        ValueError: there is no robot, no trial or no step; keys are not typed keys; `circles` are
-            not one existing start circle for each trial.
+        ValueError, TypeError: there is no robot, no trial or no step; keys are not typed keys;
+            `circles` are not one existing start circle or negative number for each trial; what
+            each robot has for itself is not there once for each key.
     """
     require_keys(keys)
     require_whole("n_trials", n_trials, 1, "ask for at least one trial")
     require_whole("max_steps", max_steps, 1, "allow at least one control step")
     require_whole("first", first, 0, "count trials from 0")
-    check_circles(map, circles, n_trials)
+    if run is not None:
+        require_count("run", run, 0, "0 runs none of them")
+        asked = concrete(run)
+        require(
+            asked is None or bool(asked <= n_trials),
+            f"run={run}: expected at most n_trials = {n_trials}; raise n_trials",
+        )
+    circles = given_circles(map, circles, n_trials)
     robots = keys.shape[0]
+    require_mapped("states", 0, states, robots)
+    require_mapped("params", params_axis, params, robots)
+    require_mapped("map", map_axis, map, robots)
     n_info = len(agent.info)
 
     def begin(key: Array, map: world.WorldParams) -> tuple[_Start, TrialResult]:
@@ -289,6 +312,7 @@ def run_trial(
     Returns:
         The agent's state and a TrialResult without leading axes.
     """
+    require_key(key)
     one = jax.tree.map(lambda x: x[None], state)
     state, result = run_phase(
         agent, params, map, one, keys=key[None], n_trials=1, max_steps=max_steps, record=record

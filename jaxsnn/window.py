@@ -21,7 +21,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsnn._checks import default_float, require, require_whole
-from jaxsnn.plasticity import STDPParams, STDPState, Traces, check_stdp, stdp_step
+from jaxsnn.plasticity import STDPParams, STDPState, Traces, check_spikes, check_stdp, stdp_step
 
 
 class STDPKernel(NamedTuple):
@@ -119,11 +119,13 @@ def stdp_window(
         after each step, times dt.
 
     Raises:
-        ValueError: the kernel is for another number of steps than there are spikes.
+        ValueError: the kernel is for another number of steps than there are spikes, or the spikes
+            are of other layers than the state.
 
     Source: Shim (2020), Eq. 2.4-2.7, summed over a window in closed form.
     """
     steps = kernel.plus.shape[-1]
+    check_spikes(state, pre, post, lead=1)
     require(
         pre.shape[0] == post.shape[0] == steps,
         f"pre=<{pre.shape[0]} steps>, post=<{post.shape[0]} steps>: expected the {steps} steps of "
@@ -163,6 +165,11 @@ def stdp_steps(
     dt: float,
 ) -> tuple[STDPState, Float[Array, "n_pre n_post"]]:
     """What `stdp_window` computes, step by step: the definition it is tested against."""
+    check_spikes(state, pre, post, lead=1)
+    require(
+        pre.shape[0] == post.shape[0],
+        f"pre=<{pre.shape[0]} steps>, post=<{post.shape[0]} steps>: expected as many; cut one",
+    )
 
     def body(carry: tuple[STDPState, Array], spikes: tuple[Array, Array]) -> tuple:
         traces, total = carry

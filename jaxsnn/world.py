@@ -28,7 +28,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Int, Key
 
 from jaxsnn import geometry
-from jaxsnn._checks import concrete, require_key
+from jaxsnn._checks import concrete, require, require_circles, require_key
 from jaxsnn.way import WayLength, remaining_way, turn_onto_way
 
 N_SONARS = 5
@@ -136,13 +136,23 @@ def reset(
     Args:
         params: the map.
         key: typed PRNG key.
-        circle: index of the start circle; drawn with `start_probs` when it is not given or, in an
-            array, negative.
+        circle: number of the start circle, from 0; drawn with `start_probs` when it is not given
+            or negative.
 
     Returns:
         WorldState at step 0.
+
+    Raises:
+        ValueError, TypeError: the map has no such start circle, or it is no single whole number
+            (a traced one is not looked at); the key is not one typed key.
     """
     require_key(key)
+    if circle is not None:
+        shape = np.shape(circle)
+        require(shape == (), f"circle=<shape {shape}>: expected one number; vmap over them")
+        require_circles("circle", circle, params.start_probs)
+        if isinstance(circle, int) and circle < 0:
+            circle = None
     keys = jax.random.split(key, 5)
     dtype = params.starts.dtype
     if not isinstance(circle, int):

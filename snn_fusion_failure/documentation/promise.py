@@ -19,7 +19,7 @@ BY_PATH = {
     "jaxsnn.declared_agent": "such a network as the driver of a robot",
     "jaxsnn.drivers": "drivers that do not learn, for comparison",
     "jaxsnn.map_files": "maps from files",
-    "jaxsnn.navigation": "the robot as a task for PPO",
+    "jaxsnn.navigation": "the robot as a task for PPO, and for learners written for gymnax",
     "jaxsnn.ppo": "proximal policy optimisation",
     "jaxsnn.plots": "pictures (matplotlib)",
     "fusion.failure_odds": "which sensors have failed, for kinds never trained on, too",

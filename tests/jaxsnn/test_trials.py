@@ -172,6 +172,40 @@ def test_experiment_learns_then_freezes():
     np.testing.assert_allclose(still.states.weights.hidden, start, rtol=1e-6)
 
 
+def test_a_phase_of_no_trials_is_left_out() -> None:
+    """Given states are tested as they are, with agents of one's own and with the network."""
+    agent = scripted(lambda p, r: 0.0)
+    run = jax.jit(
+        lambda states, keys: run_experiment(
+            None, None, PLACE, keys=keys, n_learn=0, n_test=2, max_steps=3, states=states,
+            agents=(agent, agent), keep_states=True,
+        )
+    )  # fmt: skip
+    out = run(jnp.full((2, 2), 7), keys(2))
+    assert (out.states == 7).all() and out.learning.status.shape == (2, 0)
+    assert out.testing.steps.tolist() == [[3, 3]] * 2
+    for learn, test in ((0, 2), (2, 0)):
+        out = jax.eval_shape(
+            lambda k, learn=learn, test=test: run_experiment(
+                SMALL, snn_params(SMALL, PARAMS), PLACE, keys=k, n_learn=learn, n_test=test,
+                max_steps=3, circles=[0] * learn,
+            ),
+            keys(2),
+        )  # fmt: skip
+        assert (out.learning.steps.shape, out.testing.steps.shape) == ((2, learn), (2, test))
+
+
+def test_a_negative_start_circle_is_drawn() -> None:
+    key = jax.random.key(0)
+    given, drawn = (
+        start_states(PLACE, circles, key=key, n_trials=3) for circles in ([-1, 1, -1], None)
+    )
+    x, y = np.asarray(given.x), np.asarray(drawn.x)
+    np.testing.assert_array_equal(x[[0, 2]], y[[0, 2]])
+    one = world.reset(PLACE, key=key, circle=-1)
+    assert float(one.x) == float(world.reset(PLACE, key=key).x) > 0.0
+
+
 @pytest.mark.slow
 def test_nan_weights_stop_one_robot_only():
     learner, params = snn_agent(SMALL), snn_params(SMALL, PARAMS)

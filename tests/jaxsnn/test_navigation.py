@@ -32,7 +32,7 @@ def test_the_gymnax_pair_is_the_environment_with_fresh_starts() -> None:
         np.testing.assert_allclose(reward, made.reward, rtol=1e-6, atol=1e-6)
         np.testing.assert_array_equal(done, made.terminated | made.truncated)
         np.testing.assert_array_equal(info["truncated"], made.truncated)
-        np.testing.assert_array_equal(info["discount"], 1.0 - made.terminated)
+        np.testing.assert_array_equal(info["discount"], np.where(made.terminated, 0.0, 1.0))
         expected, seen = made.state, made.obs
         if bool(done.any()):
             assert bool(done.all())

@@ -104,7 +104,7 @@ def plot_errors(
     across = min(3, len(runs))
     down = -(-len(runs) // across)
     figure = Figure(figsize=(3.3 * across + 1.8, 2.7 * down + 0.4), layout="constrained", dpi=150)
-    panels = figure.subplots(down, across, squeeze=False, sharey=True).flat
+    panels = list(figure.subplots(down, across, squeeze=False, sharey=True).flat)
     methods = list(dict.fromkeys(m for found in runs.values() for m in found))
     low, high = 0.05, 20.0
     for axes, (title, found) in zip(panels, runs.items(), strict=False):
@@ -128,7 +128,7 @@ def plot_errors(
         axes.set_title(title, fontsize=8)
         axes.tick_params(which="both", labelsize=7)
         axes.set_xlabel("simulations", fontsize=7)
-    for axes in list(panels):
+    for axes in panels[len(runs) :]:
         axes.set_visible(False)
     figure.supylabel("estimate / P", fontsize=8)
     marks = [

@@ -111,3 +111,12 @@ def test_searches_are_measured_without_any_method(tmp_path):
     assert by["gradient_corner", "first_failure"] == 14.0  # nominal, a difference each, the corner
     fields = study.result({"rows": rows})
     assert fields == {"rows": len(rows)}
+
+
+def test_a_picture_has_a_panel_for_each_problem_and_no_other():
+    from failure.plots import plot_errors
+
+    one = np.array([10.0, 20.0]), np.array([1.0, 1.1]), np.array([True, False])
+    for count in (1, 2, 4, 7):
+        figure = plot_errors({f"row {k}": {"lines": one} for k in range(count)})
+        assert sum(axes.get_visible() for axes in figure.axes) == count

@@ -153,7 +153,7 @@ def require_mapped(name: str, axes: Any, tree: Any, robots: int) -> None:
 
     form = jax.tree.structure(axes, is_leaf=none)
     try:
-        form.flatten_up_to(tree)
+        form.flatten_up_to(tree)  # type: ignore[attr-defined]  # missing in the stubs
     except ValueError as error:
         raise ValueError(
             f"{name}_axis={axes!r}: expected 0, None, or a tree of them as {name} begins; build "

@@ -1,7 +1,5 @@
 """Studies beside Tables 3.1 to 3.6: other splits, signals, failures on known readings, mixtures.
 
-    python scripts/studies/study_sensors.py --study driver_heads
-    python scripts/studies/study_sensors.py --study driver_heads --seeds 1 --models argate_l
     python scripts/studies/study_sensors.py --study driver_heads --validation --models argate_plus
     python scripts/studies/study_sensors.py --study driver_trip
     python scripts/studies/study_sensors.py --study driver_tagged
@@ -9,11 +7,11 @@
     python scripts/studies/study_sensors.py --study kept_out_kinds --seeds 2
     python scripts/studies/study_sensors.py --study gate_targets
 
-`driver_heads` has the driver's neighbourhood head and the signals of the default set;
-`driver_trip` holds out whole trips; `driver_tagged` has the earlier stand-ins, one of which names
-trips; `known_readings` lets sensors fail on values that they give when they work, with and without
-the feature that tells known readings; `kept_out_kinds` trains HAR on all kinds of failure but one
-and tests on that one; `gate_targets` compares what the gate can learn from.
+`driver_heads` has the rows of Table 3.5, for choices on validation rows (the table itself is made
+by `reproduce.py`); `driver_trip` holds out whole trips; `driver_tagged` has the earlier stand-ins,
+one of which names trips; `known_readings` lets sensors fail on values that they give when they
+work, with and without the feature that tells known readings; `kept_out_kinds` trains HAR on all
+kinds of failure but one and tests on that one; `gate_targets` compares what a gate can learn from.
 
 Nothing is chosen here: a run trains the preset for all of its epochs and is scored once, on the
 test rows, or with `--validation` on training rows that `--split-seed` draws and no training sees.

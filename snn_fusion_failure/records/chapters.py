@@ -177,6 +177,8 @@ def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Done:
     written: Written = {}
     for table in tables:
         rows, studies = fusion_tables.collect(table, out, seeds, source_tables())
+        # Columns that were not asked for keep the command and the seeds that made them.
+        rows = [row for row in rows if plan.wants(row["model"])]
         if not rows:
             continue
         title, _ = fusion_tables.TABLES[table]

@@ -12,7 +12,14 @@ from jaxtyping import Array, Float, Key
 from failure.estimates import Estimate, add, check_threshold
 from failure.hlrf import DesignPoint, find_design_point, onto_boundary
 from failure.lines import BEND, sample_lines
-from failure.opposite import beside, check_scan, explained, fails, wide_scale
+from failure.opposite import (
+    beside,
+    check_scan,
+    explained,
+    fails,
+    opposite_sides_fail,
+    wide_scale,
+)
 from failure.performances import Counted, Performance, Slopes
 
 ALIKE = 0.9
@@ -157,8 +164,7 @@ def probability_by_lines(
                 continue
             finder.points.append(new)
             results.append(lines.estimate)
-            mirror = -(new.beta + 0.5) * new.axis
-            if float(np.nan_to_num(counted(mirror[None])[0], nan=-np.inf)) > threshold:
+            if opposite_sides_fail(counted, threshold, new.axis[None], np.array([new.beta]))[0]:
                 starts.append(-new.beta * new.axis)
             waiting += [found for start in starts if (found := finder.find(start))]
 
@@ -214,7 +220,7 @@ def _connected(finder: _Finder, counted: Counted, threshold: float) -> list[str]
     for a, b in pairs[:20]:
         middle = a.axis + b.axis
         middle *= 1.01 * max(a.beta, b.beta) / float(np.linalg.norm(middle))
-        if float(np.nan_to_num(counted(middle[None])[0], nan=-np.inf)) > threshold:
+        if fails(counted, threshold, middle[None])[0]:
             return ["two regions are connected: failures lie on a whole arc, use subset_simulation"]
     return []
 

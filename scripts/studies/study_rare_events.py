@@ -121,7 +121,7 @@ def main(config: Config) -> dict[str, Any]:
             def important(k: int, points: Any, case: Problem = case) -> Any:
                 return rare_events.importance_sampling(
                     case.performance, case.threshold, points, key=jax.random.key(k),
-                    n=config.n_importance,
+                    n=config.n_importance, scan=0,
                 )  # fmt: skip
 
             def subset(k: int, case: Problem = case) -> Any:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from functools import partial
 
 import jax
@@ -11,7 +12,7 @@ import pytest
 
 from fusion.detection.config import DenseConfig
 from fusion.detection.geometry.overlaps import box3d_iou
-from fusion.detection.learning.box_overlap import box_overlaps, overlap_loss
+from fusion.detection.learning.box_overlap import box_overlaps, _most_near, overlap_loss
 from fusion.detection.learning.dense_targets import decode_cells, grid_targets
 from fusion.detection.network.dense import N_OUTPUTS
 from fusion.detection.presets import preset
@@ -39,6 +40,20 @@ def test_overlaps_are_those_of_the_evaluator() -> None:
     assert 0.2 < wanted.mean() < 0.9
     np.testing.assert_allclose(np.asarray(got)[near], wanted, atol=1e-4)
     np.testing.assert_allclose(np.asarray(got)[~near], 1.0, atol=1e-4)
+
+
+@pytest.mark.parametrize(("cell", "radius"), [(0.5, 0.9), (0.5, 0.6), (1.0, 0.4), (0.5, 2.3)])
+def test_all_cells_near_a_car_are_among_those_gathered(cell: float, radius: float) -> None:
+    dense = dataclasses.replace(TINY.dense, cell=cell, radius=radius)
+    config = dataclasses.replace(TINY, max_objects=1, dense=dense)
+    places = np.random.RandomState(0).uniform([-6.0, 6.0], [6.0, 18.0], (200, 2))
+    targets = jax.jit(partial(grid_targets, config))
+    most = 0
+    for x, z in places:
+        frame = _inputs(jnp.array([[x, 1.5, z, 4.2, 1.7, 1.5, 0.3]]), jnp.ones(1, bool))
+        near = targets(frame).near
+        most = max(most, int(near.sum()))
+    assert 1 <= most <= _most_near(config) < near.size
 
 
 def test_the_loss_falls_with_the_overlap_and_pulls_the_box() -> None:

@@ -21,7 +21,7 @@ from typing import NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
-from jaxtyping import Array, Bool, Float
+from jaxtyping import Array, Bool, Float, Int
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import wrap_angle
@@ -142,14 +142,27 @@ def average_cells(
 
 
 def decode_cells(
-    config: DetectorConfig, boxes: Float[Array, "r s 10"], plane: Float[Array, "4"]
+    config: DetectorConfig,
+    boxes: Float[Array, "*n 10"],
+    plane: Float[Array, "4"],
+    cells: Int[Array, "n"] | None = None,
 ) -> Float[Array, "n 7"]:
-    """3D boxes that the cells tell, in the order of the flattened grid."""
+    """3D boxes that the cells tell, in the order of the flattened grid.
+
+    Args:
+        config: gives grid and mean sizes.
+        boxes: what all cells tell `[r, s, 10]`, or `[n, 10]` what some of them tell.
+        plane: ground of the frame.
+        cells: places of the latter in the flattened grid.
+    """
     x, z = (jnp.asarray(a) for a in grid_centres(config))
+    if cells is not None:
+        x, z = x.ravel()[cells], z.ravel()[cells]
     at_x, at_z = x + boxes[..., 0], z + boxes[..., 1]
     y = plane_y(plane, at_x, at_z) + 0.5 * boxes[..., 2]
     log_size = jnp.clip(0.5 * boxes[..., 3:6], -_LOG_LIMIT, _LOG_LIMIT)
-    size = jnp.asarray(_mean_size(config))[None, None] * jnp.exp(log_size)
+    mean = jnp.broadcast_to(jnp.asarray(_mean_size(config)), log_size.shape)
+    size = mean * jnp.exp(log_size)
     # Features that are all zero tell no axis, and the angle of (0, 0) has no gradient.
     untold = (boxes[..., 6] == 0.0) & (boxes[..., 7] == 0.0)
     axis = 0.5 * jnp.arctan2(boxes[..., 7], jnp.where(untold, 1e-3, boxes[..., 6]))

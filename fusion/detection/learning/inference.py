@@ -5,8 +5,8 @@ from __future__ import annotations
 from typing import Any
 
 import jax
-import jax.numpy as jnp
 import numpy as np
+from jaxtyping import Array
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.geometry.encodings import box_corners, project_boxes
@@ -38,6 +38,11 @@ def detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Det
     )
 
 
+@jax.jit
+def _project(boxes: Array, p2: Array, height: Array, width: Array) -> Array:
+    return project_boxes(box_corners(boxes), p2, height, width)
+
+
 def to_objects(
     detections: Detections, p2: np.ndarray, image_size: np.ndarray, name: str = "Car"
 ) -> Objects:
@@ -49,12 +54,12 @@ def to_objects(
         image_size: rows and columns of the image [pixel].
         name: their class.
     """
-    boxes = np.asarray(detections.boxes, np.float32)[np.asarray(detections.mask)]
-    scores = np.asarray(detections.scores, np.float64)[np.asarray(detections.mask)]
+    mask, boxes = np.asarray(detections.mask), np.asarray(detections.boxes, np.float32)
     height, width = (float(v) for v in image_size)
-    corners = box_corners(jnp.asarray(boxes))
-    unit = project_boxes(corners, jnp.asarray(p2, jnp.float32), height, width)
-    pixels = np.asarray(unit, np.float64)[:, [1, 0, 3, 2]]
+    # All rows, so that one compiled program serves every frame.
+    unit = _project(boxes, np.asarray(p2, np.float32), height, width)
+    boxes, scores = boxes[mask], np.asarray(detections.scores, np.float64)[mask]
+    pixels = np.asarray(unit, np.float64)[mask][:, [1, 0, 3, 2]]
     pixels = np.clip(pixels, 0.0, 1.0) * [width - 1, height - 1, width - 1, height - 1]
     seen = (pixels[:, 2] - pixels[:, 0] > 1.0) & (pixels[:, 3] - pixels[:, 1] > 1.0)
     seen &= boxes[:, 2] > 0.0

@@ -11,6 +11,7 @@ integrals.
 
 from __future__ import annotations
 
+import jax
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Float
@@ -46,7 +47,12 @@ def lift(
     """
     x, z = (jnp.asarray(a) for a in grid_centres(config))
     ground = -(plane[0] * x + plane[2] * z + plane[3]) / plane[1]
-    height, width, _ = features.shape
+    height, width, channels = features.shape
+    # Each pixel beside its right, lower and lower right neighbours: one place is read for a point,
+    # and one written in the gradient, in place of four.
+    padded = jnp.pad(features, ((0, 1), (0, 1), (0, 0)), mode="edge")
+    corners = [padded[i : i + height, j : j + width] for i in (0, 1) for j in (0, 1)]
+    table = jnp.stack(corners, axis=2).reshape(height * width, 4, channels)
     found = []
     for above in config.dense.heights:
         points = jnp.stack([x, ground - above, z, jnp.ones_like(x)], axis=-1)
@@ -58,9 +64,10 @@ def lift(
         u, v = jnp.where(inside, u, 0.0), jnp.where(inside, v, 0.0)
         left = jnp.clip(jnp.floor(u), 0, max(width - 2, 0)).astype(jnp.int32)
         top = jnp.clip(jnp.floor(v), 0, max(height - 2, 0)).astype(jnp.int32)
-        right, low = jnp.minimum(left + 1, width - 1), jnp.minimum(top + 1, height - 1)
-        fu, fv = (u - left.astype(u.dtype))[..., None], (v - top.astype(v.dtype))[..., None]
-        upper = features[top, left] * (1 - fu) + features[top, right] * fu
-        lower = features[low, left] * (1 - fu) + features[low, right] * fu
-        found.append(jnp.where(inside[..., None], upper * (1 - fv) + lower * fv, 0.0))
+        fu, fv = u - left.astype(u.dtype), v - top.astype(v.dtype)
+        shares = [(1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu]
+        shares = jnp.where(inside[..., None], jnp.stack(shares, axis=-1), 0.0)
+        # Kept apart, or the gradient would compute them anew for every channel of every corner.
+        at, shares = jax.lax.optimization_barrier((top * width + left, shares))
+        found.append(jnp.einsum("rsk,rskc->rsc", shares, table[at]))
     return jnp.concatenate(found, axis=-1)

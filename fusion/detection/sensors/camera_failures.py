@@ -80,10 +80,16 @@ def _blur(key: PRNGKeyArray, image: Array, s: Array, depth: Array | None) -> Arr
     # A hundredth of a pixel keeps the weights finite; it blurs nothing.
     kernel = jax.nn.softmax(-0.5 * (offset / jnp.maximum(s * largest, 0.01)) ** 2)
     padded = jnp.pad(image, ((radius, radius), (radius, radius), (0, 0)), mode="edge")
-    planes = padded.transpose(2, 0, 1)[:, None]
-    for window in (kernel[None, None, :, None], kernel[None, None, None, :]):
-        planes = jax.lax.conv_general_dilated(planes, window, (1, 1), "VALID")
-    return planes[:, 0].transpose(1, 2, 0)
+    # As products with banded matrices: a convolution of one channel leaves a CPU's registers empty.
+    columns = [_banded(kernel, side) for side in image.shape[:2]]
+    return jnp.einsum("ia,jb,abc->ijc", *columns, padded, optimize="optimal")
+
+
+def _banded(kernel: Float[Array, "k"], n: int) -> Float[Array, "n m"]:
+    """The matrix whose product is the convolution without padding, with n results."""
+    offset = jnp.arange(n + kernel.size - 1)[None] - jnp.arange(n)[:, None]
+    inside = (offset >= 0) & (offset < kernel.size)
+    return jnp.where(inside, kernel[jnp.clip(offset, 0, kernel.size - 1)], 0.0)
 
 
 def _fog(key: PRNGKeyArray, image: Array, s: Array, depth: Array | None) -> Array:

@@ -12,7 +12,7 @@ import pytest
 
 from fusion.detection.config import DenseConfig
 from fusion.detection.geometry.overlaps import box3d_iou
-from fusion.detection.learning.box_overlap import box_overlaps, _most_near, overlap_loss
+from fusion.detection.learning.box_overlap import _most_near, box_overlaps, overlap_loss
 from fusion.detection.learning.dense_targets import decode_cells, grid_targets
 from fusion.detection.network.dense import N_OUTPUTS
 from fusion.detection.presets import preset

@@ -13,6 +13,7 @@ import jax.numpy as jnp
 from jaxtyping import Array, Float
 
 from jaxsnn import native
+from jaxsnn._checks import require
 from jaxsnn.config import (
     NetworkConfig,
     NetworkParams,
@@ -47,6 +48,17 @@ __all__ = [
     "step",
     "window",
 ]
+
+
+def _check_inputs(config: NetworkConfig, pre: Array, *lead: str) -> None:
+    """Refuse input spikes of another width, or with other axes before it than `lead`."""
+    shape = jnp.shape(pre)
+    expected = ", ".join([*lead, str(config.n_in)]) + ("" if lead else ",")
+    require(
+        len(shape) == len(lead) + 1 and shape[-1] == config.n_in,
+        f"pre=<shape {shape}>: expected ({expected}), a column for each input neuron of the config "
+        "(n_in); make the spikes for this config, and vmap over robots",
+    )
 
 
 def _centred(params: NetworkParams, state: NetworkState, pre: Array, hidden: Array) -> tuple:
@@ -107,7 +119,11 @@ def step(
 
     Returns:
         The new state and the spikes of this step.
+
+    Raises:
+        ValueError: `pre` or `reward` has another shape.
     """
+    _check_inputs(config, pre)
     sign_pre, _ = neuron_signs(config)
     weights = state.weights
     jump = params.gain_input * ((pre * sign_pre) @ weights.hidden)
@@ -153,7 +169,12 @@ def kernel(config: NetworkConfig, params: NetworkParams) -> STDPKernel:
 def fire(
     config: NetworkConfig, params: NetworkParams, state: NetworkState, pre: Float[Array, "t n_in"]
 ) -> tuple[NetworkState, Spikes]:
-    """Run the neurons over the rows of `pre` with the weights held and no plasticity."""
+    """Run the neurons over the rows of `pre` with the weights held and no plasticity.
+
+    Raises:
+        ValueError: `pre` has another shape.
+    """
+    _check_inputs(config, pre, "steps")
     sign_pre, _ = neuron_signs(config)
     if config.engine == "native":
         native.check(state.weights.hidden)
@@ -198,6 +219,9 @@ def window(
     Returns:
         The state with the weights as they were, the eligibility of the window for `reinforce`, and
         all spikes.
+
+    Raises:
+        ValueError: `pre` has another shape.
     """
     state, spikes = fire(config, params, state, pre)
     return *remember(config, params, stdp, state, pre, spikes, keep), spikes
@@ -238,7 +262,11 @@ def remember(
 
     Returns:
         The state with new traces and running means, and the eligibility of the window.
+
+    Raises:
+        ValueError: `pre` has another shape.
     """
+    _check_inputs(config, pre, "steps")
     if config.engine == "native":
         stdp_hidden, stdp_output, first, second = native.remember(
             params.stdp, (state.stdp_hidden, state.stdp_output), pre, *spikes,

@@ -8,6 +8,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
+from jaxsnn._checks import require
 from jaxsnn.config import NetworkConfig, NetworkParams, Weights, neuron_signs, weight_bounds
 from jaxsnn.mirror import tied
 from jaxsnn.plasticity import apply_reward
@@ -63,9 +64,17 @@ def reinforce(
     Returns:
         The new weights, inside their bounds.
 
+    Raises:
+        ValueError: `reward` is not one number for each motor.
+
     Source:
         Shim (2020), Eq. 2.3 or 2.8 with the sign adjustment of section 2.3.2. Homeostasis is ours.
     """
+    require(
+        jnp.shape(reward) == (2,),
+        f"reward=<shape {jnp.shape(reward)}>: expected (2,), the left and the right motor's; give "
+        "one number to both with jnp.full(2, r)",
+    )
     dtype = weights.hidden.dtype
     sign_pre, sign_hidden = (jnp.asarray(s, dtype) for s in neuron_signs(config))
     to_first, to_second = synapse_signs(sign_pre, sign_hidden)

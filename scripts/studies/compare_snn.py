@@ -7,8 +7,9 @@ the same starts, and writes `results/study_paired_2_3.json` and so on: multiplic
 additive learning (S2 - S1, S4 - S3), and networks with inhibitory hidden neurons against those
 without (S3 - S1, S4 - S2), in points of the success rate in testing. From
 `results/study_snn_trials.json` and `results/study_rl.json` it collects in one table,
-`results/study_sample_efficiency.json`, after how many training trials at least 90 % of the testing
-trials arrive: spiking networks, PPO, Q-learning. A second.
+`results/study_sample_efficiency.json`, after how many training trials at least 90 % of the trials
+arrive on Scenarios 1-3 and D1-D3, and the share of learners that get there: spiking networks and
+Q-learning (of their testing trials), PPO (of its latest training trials). A second.
 """
 
 from __future__ import annotations
@@ -52,7 +53,7 @@ def compare(table: dict[str, Any], metric: str) -> list[dict[str, Any]]:
 
 
 def sample_efficiency(results: Path) -> list[dict[str, Any]]:
-    """Rows `trials_to_90` of all learners by scenario, from the studies that are there."""
+    """Rows on the way to 90 % of all learners by map, from the studies that are there."""
     rows = []
     for name in ("study_snn_trials", "study_rl"):
         path = results / f"{name}.json"
@@ -60,9 +61,9 @@ def sample_efficiency(results: Path) -> list[dict[str, Any]]:
             continue
         held = json.loads(path.read_text(encoding="utf-8"))
         for row in held["rows"]:
-            if row["metric"] == "trials_to_90":
-                command = {"command": row.get("command") or held["command"]}
-                rows.append(command | row | {"row": row["row"].removeprefix("trained on ")})
+            if row["metric"] in ("trials_to_90", "share_reaching_90"):
+                made = {name: row.get(name) or held[name] for name in ("command", "git")}
+                rows.append(row | made | {"row": row["row"].removeprefix("trained on ")})
     return rows
 
 
@@ -82,7 +83,7 @@ def main(config: Compare) -> dict[str, int]:
     rows = sample_efficiency(config.results)
     if rows:
         name = "study_sample_efficiency"
-        title = "Training trials until 90 % of the testing trials arrive"
+        title = "Training trials until 90 % arrive: of tests, PPO's of its latest training trials"
         path = config.results / f"{name}.json"
         record_table(path, name, title, rows, preset="paper")
     if not written:

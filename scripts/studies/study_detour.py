@@ -54,14 +54,6 @@ NETWORKS = (
 )
 LEARNERS = ("q_learning", "ppo")
 UNITS = {"path_ratio": "1"}
-PPO: dict[str, Any] = {
-    "n_envs": 32,
-    "n_steps": 128,
-    "n_updates": 100,
-    "n_minibatches": 8,
-    "initial_std": 0.8,
-}
-PPO_PARAMS = {"learning_rate": 1e-3}
 # Robot by robot, same seeds and starts: the networks against drivers that learn nothing, the
 # multiplicative rule against the additive one, and inhibition against none.
 COMPARED = Compared(
@@ -150,13 +142,13 @@ def run_q_learning(config: Study, model: str, row: str) -> dict[str, list[float]
     import jax
     import jax.numpy as jnp
 
-    from jaxsnn import qlearning
+    from jaxsnn import learners, qlearning
 
     run = jax.jit(qlearning.run_trials, static_argnames=("n_trials", "max_steps", "learn"))
     params = qlearning.QParams(*(jnp.float32(v) for v in qlearning.QParams()))
     keys = jax.random.split(jax.random.key(31), config.seeds)
     tables, map = qlearning.init(config.seeds), train_map(row)
-    for done in range(0, 2000, 100):
+    for done in range(0, learners.CHECKPOINTS[-1], 100):
         tables, _ = run(
             params, map, tables, keys=keys, n_trials=100, max_steps=config.max_steps,
             learn=True, first_trial=done,
@@ -177,10 +169,10 @@ def run_ppo(config: Study, model: str, row: str) -> dict[str, list[float]]:
     import jax
     import jax.numpy as jnp
 
-    from jaxsnn import learners, ppo, ways
+    from jaxsnn import learners, ways
 
-    sizes, map = ppo.PPOConfig(**PPO), train_map(row)
-    params = jax.tree.map(jnp.float32, ppo.PPOParams(**PPO_PARAMS))
+    sizes, map = learners.DETOUR_PPO, train_map(row)
+    params = jax.tree.map(jnp.float32, learners.DETOUR_PPO_PARAMS)
     weights = learners.ppo_policies(
         sizes, params, map, ways.way_length(map),
         keys=jax.random.split(jax.random.key(41), config.seeds), max_steps=config.max_steps,

@@ -23,7 +23,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
-from snn_fusion_failure.records.detour_rows import train_map
+from snn_fusion_failure.records.detour_rows import row_name, train_map
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
@@ -62,14 +62,10 @@ class Transfer:
     """Write the rows into results/."""
 
 
-def _row(scenario: str) -> str:
-    return scenario if scenario.startswith("D") else f"Scenario {scenario}"
-
-
 def _training_map(network: Any, scenario: str) -> Any:
     from jaxsnn import ways
 
-    map = train_map(_row(scenario))
+    map = train_map(row_name(scenario))
     return ways.with_way(map) if network.guidance == "way" else map
 
 
@@ -209,14 +205,14 @@ def main(config: Transfer) -> dict[str, dict[str, list[float]]]:
             found[scenario] = values
             name = shown_metric(config)
             mean = sum(values[name]) / len(values[name])
-            bar.update(task, advance=1, status=f"{_row(scenario)}: {mean:.0f} %")
+            bar.update(task, advance=1, status=f"{row_name(scenario)}: {mean:.0f} %")
             if not config.record:
                 continue
             model: str = config.model
             if config.reading != "tuned":
                 model += f" {config.reading}"
             rows = [
-                {"row": f"trained on {_row(scenario)}", "model": model, "metric": metric,
+                {"row": f"trained on {row_name(scenario)}", "model": model, "metric": metric,
                  "unit": UNITS.get(metric, "%"), **summarize(v)}
                 for metric, v in values.items() if v
             ]  # fmt: skip

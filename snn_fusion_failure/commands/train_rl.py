@@ -1,13 +1,18 @@
-"""Q-learning and PPO on Scenarios 1-3: the baselines of the spiking networks.
+"""Q-learning and PPO on Scenarios 1-3 and D1-D3: the baselines of the spiking networks.
 
     python scripts/train_rl.py --model qlearning --seeds 64 --record
     python scripts/train_rl.py --model ppo --seeds 16 --record
+    python scripts/train_rl.py --model ppo --scenarios D1 D2 D3 --seeds 16 --record
 
 Each seed is an independent learner with its own starts. The first command (2,000 training and 100
 testing trials, as the source) takes about five minutes on one core, the second about four;
 `--preset quick` takes one minute. `--record` writes the rows of Tables 2.3-2.5 for Q-learning and
 `results/study_rl.json`. Expect a success rate in testing near 100 % for both, far above the
 source's Q-learning (10, 0 and 0 %); docs/snn_world.md says what that means.
+
+On the detours D1 to D3 PPO has the sizes and rates of `scripts/studies/study_detour.py` (about
+10,000 trials) and a reward that counts progress along the shortest way; their rows go to
+`results/study_rl.json` alone.
 """
 
 from __future__ import annotations
@@ -20,6 +25,7 @@ from typing import Annotated, Any, Literal
 
 from tyro.conf import arg
 
+from snn_fusion_failure.records.detour_rows import row_name, train_map
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import (
     append_metrics,
@@ -33,7 +39,9 @@ from snn_fusion_failure.runs import (
 from snn_fusion_failure.runs.command import run_command
 from snn_fusion_failure.runs.origin import check_recordable
 
-TABLES = {1: "2.3", 2: "2.4", 3: "2.5"}
+TABLES = {"1": "2.3", "2": "2.4", "3": "2.5"}
+# Number of a map -> its own root of keys; those of Scenarios 1-3 are the numbers of record.
+MAPS = {"1": 1, "2": 2, "3": 3, "D1": 11, "D2": 12, "D3": 13}
 NAMES = {"qlearning": "Q-learning", "ppo": "PPO"}
 
 
@@ -44,7 +52,8 @@ class Config:
     model: Annotated[Literal["qlearning", "ppo"], arg(aliases=["--algorithm"])] = "qlearning"
     preset: Literal["paper", "quick"] = "paper"
     """quick: 4 seeds, a tenth of the training."""
-    scenarios: tuple[int, ...] = (1, 2, 3)
+    scenarios: tuple[str, ...] = ("1", "2", "3")
+    """Maps: 1 to 3, or D1 to D3 for their detour readings."""
     seeds: int = 64
     """Independent training runs."""
     test_trials: int = 100
@@ -70,14 +79,22 @@ class Config:
     """Replace the run in the folder."""
 
 
-def build(config: Config) -> dict[str, Any]:
-    """The constants of the learner (and the sizes of PPO) with the command line's changes."""
-    from jaxsnn import ppo, qlearning
+def _is_detour(scenario: str) -> bool:
+    return scenario.startswith("D")
+
+
+def build(config: Config, scenario: str) -> dict[str, Any]:
+    """The learner's constants (and PPO's sizes) on a map, with the command line's changes."""
+    from jaxsnn import learners, ppo, qlearning
 
     parts: dict[str, Any] = {"params": qlearning.QParams()}
     if config.model == "ppo":
-        sizes = ppo.PPOConfig(n_updates=150 if config.preset == "paper" else 30)
-        parts = {"params": ppo.PPOParams(), "config": sizes}
+        sizes, params = ppo.PPOConfig(n_updates=150), ppo.PPOParams()
+        if _is_detour(scenario):
+            sizes, params = learners.DETOUR_PPO, learners.DETOUR_PPO_PARAMS
+        if config.preset == "quick":
+            sizes = dataclasses.replace(sizes, n_updates=sizes.n_updates // 5)
+        parts = {"params": params, "config": sizes}
     given = {name: getattr(config, name) for name in ("learning_rate", "discount", "epsilon")}
     changes = [f"params.{name}={value}" for name, value in given.items() if value is not None]
     parts = apply_changes(parts, [*changes, *config.changes])
@@ -86,16 +103,17 @@ def build(config: Config) -> dict[str, Any]:
     return parts
 
 
-def train(config: Config, parts: dict[str, Any], number: int) -> dict[str, list[float]]:
-    """One scenario: percentages and means, one value for each seed."""
-    from jaxsnn import learners, scenarios
+def train(config: Config, parts: dict[str, Any], scenario: str) -> dict[str, list[float]]:
+    """One map: percentages and means, one value for each seed."""
+    from jaxsnn import learners, ways
 
-    root, keys = learners.learner_keys(config.seed, number, config.seeds)
-    map = scenarios.scenario(number)
+    root, keys = learners.learner_keys(config.seed, MAPS[scenario], config.seeds)
+    map = train_map(row_name(scenario))
     if config.model == "ppo":
         return learners.train_ppo(
             parts["config"], parts["params"], map, keys=keys,
             n_test=config.test_trials, max_steps=config.max_steps,
+            way=ways.way_length(map) if _is_detour(scenario) else None,
         )  # fmt: skip
     return learners.train_qlearning(
         parts["params"], map, key=root, learners=config.seeds,
@@ -105,7 +123,9 @@ def train(config: Config, parts: dict[str, Any], number: int) -> dict[str, list[
 
 
 def main(config: Config) -> dict[str, Any]:
-    """Train and test on every scenario asked for; returns `{scenario: {metric: summary}}`."""
+    """Train and test on every map asked for; returns `{scenario: {metric: summary}}`."""
+    if unknown := [s for s in config.scenarios if s not in MAPS]:
+        raise ValueError(f"scenarios={unknown}: expected some of {', '.join(MAPS)}; choose")
     for name in ("seeds", "test_trials"):
         if getattr(config, name) < 1:
             raise ValueError(f"{name}={getattr(config, name)}: expected at least 1; raise it")
@@ -118,7 +138,7 @@ def main(config: Config) -> dict[str, Any]:
         check_recordable()
     if config.preset == "quick":
         config = dataclasses.replace(config, seeds=min(config.seeds, 4))
-    parts = build(config)
+    parts = {scenario: build(config, scenario) for scenario in config.scenarios}
     enable_compilation_cache()
     out = config.out or Path("runs") / f"rl_{config.model}_s{config.seed}"
     settings = {
@@ -131,24 +151,24 @@ def main(config: Config) -> dict[str, Any]:
     results: dict[str, Any] = {}
     with progress() as bar:
         task = bar.add_task(model, total=len(config.scenarios), status="")
-        for number in config.scenarios:
-            values = train(config, parts, number)
+        for scenario in config.scenarios:
+            values = train(config, parts[scenario], scenario)
             summary = {name: summarize(v) for name, v in values.items() if v}
-            results[str(number)] = summary
-            append_metrics(out, {"scenario": number, "model": model, **summary})
+            results[scenario] = summary
+            append_metrics(out, {"scenario": scenario, "model": model, **summary})
             if config.record:
-                _record(config, model, number, summary)
+                _record(config, model, scenario, summary)
             bar.update(task, advance=1, status=f"testing {summary['sr_testing']['mean']:.1f} %")
     write_json(out / "result.json", results)
     return results
 
 
-def _record(config: Config, model: str, number: int, summary: dict[str, Any]) -> None:
-    """Rows of one scenario into results/."""
-    units = {"sr": "%", "n_mv": "steering movements", "path": "1", "trials": "trials"}
-    row, table = f"Scenario {number}", TABLES[number]
+def _record(config: Config, model: str, scenario: str, summary: dict[str, Any]) -> None:
+    """Rows of one map into results/; a map of a table of the source has its rows there, too."""
+    units = {"sr": "%", "share": "%", "n_mv": "steering movements", "path": "1"}
+    row, table = row_name(scenario), TABLES.get(scenario)
     source_file = repository.RESULTS / "source_tables.json"
-    source = json.loads(source_file.read_text())[table]["rows"].get(model, {})
+    source = json.loads(source_file.read_text())[table]["rows"].get(model, {}) if table else {}
     cells = []
     for metric, numbers in summary.items():
         unit = next((u for start, u in units.items() if metric.startswith(start)), "trials")
@@ -156,9 +176,10 @@ def _record(config: Config, model: str, number: int, summary: dict[str, Any]) ->
         cells.append(cell | ({"source": source[metric]} if metric in source else {}))
     record_table(
         repository.RESULTS / "study_rl.json", "study_rl",
-        "Q-learning and PPO on Scenarios 1-3", cells, preset=config.preset,
+        "Q-learning and PPO on Scenarios 1-3 and the detours D1-D3", cells,
+        preset=config.preset, whole_cells=True,
     )  # fmt: skip
-    if model == "Q-learning":
+    if table and model == "Q-learning":
         record_table(
             repository.RESULTS / f"table_{table.replace('.', '_')}.json", table, row,
             [c for c in cells if c["metric"] in ("sr_learning", "sr_testing", "n_mv")],

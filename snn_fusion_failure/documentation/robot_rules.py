@@ -5,6 +5,7 @@ from __future__ import annotations
 from snn_fusion_failure.documentation.rule import Rule
 
 _ROBOT = "--seeds 1 --max-steps 3"
+_LEARNER = "--seeds 1 --test-trials 1 --max-steps 5 --overwrite"
 
 ROBOTS = (
     Rule("train_snn.py", f"{_ROBOT} --preset quick --overwrite"),
@@ -84,5 +85,7 @@ ROBOTS = (
         "bench_snn.py",
         "--robots 1 --block 1 --control-steps 1 --repeats 1 --no-accuracy --memory-robots 2",
     ),
-    Rule("train_rl.py", "--seeds 1 --scenarios 1 --test-trials 1 --max-steps 5 --overwrite"),
+    Rule("train_rl.py ppo D1", f"{_LEARNER} --scenarios D1 --set config.n_updates=1"),
+    Rule("train_rl.py D1", f"{_LEARNER} --scenarios D1"),
+    Rule("train_rl.py", f"{_LEARNER} --scenarios 1"),
 )

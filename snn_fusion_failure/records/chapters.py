@@ -94,7 +94,7 @@ def _learn(plan: Plan, table: str, network: str) -> dict[str, Any] | None:
         if plan.collect_only:
             return None
         rl = train_rl.Config(
-            preset=preset, scenarios=(scenario,), seeds=seeds, out=out, overwrite=True
+            preset=preset, scenarios=(str(scenario),), seeds=seeds, out=out, overwrite=True
         )
         return train_rl.main(rl)[str(scenario)]
     default = Path("runs") / "train_snn" / f"scenario{scenario}_{network}_tuned"

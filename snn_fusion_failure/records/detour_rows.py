@@ -13,6 +13,11 @@ def is_family(row: str) -> bool:
     return row == FAMILY or row.startswith("detour/")
 
 
+def row_name(scenario: str) -> str:
+    """What a map is called in the tables: `Scenario 1` for 1, `D1` for D1."""
+    return scenario if scenario.startswith("D") else f"Scenario {scenario}"
+
+
 def train_map(row: str) -> Any:
     """The map that a learner of a row learns on; a row may be a map's name, `detour/train/3`."""
     from jaxsnn import families, scenarios

@@ -142,12 +142,21 @@ def record_table(
     new = {key(row)[:parts] for row in rows}
     kept = [
         row if row.get("ci95") else {**row, **_ends(row)}
-        for row in recorded(path)
+        for row in _with_origin(path)
         if key(row)[:parts] not in new
     ]
     held = {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows}
     comparisons = compare_columns(held["rows"], compared)
     write_json(path, held | ({"comparisons": comparisons} if comparisons else {}))
+
+
+def _with_origin(path: Path) -> list[dict[str, Any]]:
+    """Rows of a table of record; those of old files, without a command, get their file's."""
+    if not path.exists():
+        return []
+    held = json.loads(path.read_text(encoding="utf-8"))
+    origin = {name: held[name] for name in ("command", "git") if name in held}
+    return [origin | row for row in held["rows"]]
 
 
 def _ends(row: dict[str, Any]) -> dict[str, Any]:

@@ -238,6 +238,26 @@ CALLS = {
         "network.init(jax.random.key(0), *preset('S4'), Weights(w[None], w[None]))",
         "weights.hidden=<shape (1, 1)>: expected (210, 208)",
     ),
+    "a step with spikes of another network": (
+        "network.step(config, constants, net(), w, jnp.ones(2))",
+        "pre=<shape (1,)>: expected (210,), a column for each input",
+    ),
+    "a step with a row of spikes": (
+        "network.step(config, constants, net(), jnp.ones((1, 210)), jnp.ones(2))",
+        "pre=<shape (1, 210)>: expected (210,)",
+    ),
+    "a step with one reward": (
+        "network.step(config, constants, net(), jnp.ones(210), 1.0)",
+        "reward=<shape ()>: expected (2,)",
+    ),
+    "neurons with spikes of another network": (
+        "network.fire(config, constants, net(), w2)",
+        "pre=<shape (4, 1)>: expected (steps, 210)",
+    ),
+    "traces of spikes of another network": (
+        "network.remember(config, constants, None, net(), w2, None)",
+        "pre=<shape (4, 1)>: expected (steps, 210)",
+    ),
 }
 PROGRAM = """
 import json, sys
@@ -257,6 +277,8 @@ config, constants = preset("S4")
 base = snn_params(config, constants)
 gamma_axis = jax.tree.map(lambda _: None, base)
 gamma_axis = gamma_axis._replace(network=gamma_axis.network._replace(gamma=0))
+def net():
+    return network.init(jax.random.key(0), config, constants)
 def with_gamma(n):
     return base._replace(network=base.network._replace(gamma=jnp.full(n, 1e-3)))
 def experiment(params=base, map=room, keys=keys2, **changes):

@@ -213,6 +213,16 @@ def test_a_table_that_grows_compares_the_columns_of_earlier_commands_too(tmp_pat
     assert found[0]["p_holm"] == pytest.approx(3 * first["p_value"])
 
 
+def test_rows_without_a_command_keep_that_of_their_file_when_it_grows(tmp_path: Path) -> None:
+    path, row = tmp_path / "study_x.json", {"row": "r", "model": "m", "metric": "x", "mean": 1.0}
+    held = {"command": "python old.py", "git": "abc", "rows": [row]}
+    path.write_text(json.dumps(held), encoding="utf-8")
+    record_table(path, "x", "X", [row | {"row": "other"}], preset="paper")
+    old, new = recorded(path)
+    assert (old["command"], old["git"]) == ("python old.py", "abc")
+    assert new["row"] == "other" and new["command"] != "python old.py"
+
+
 def test_a_table_grows_and_is_corrected(tmp_path: Path) -> None:
     path = tmp_path / "table_3_1.json"
 

@@ -97,7 +97,7 @@ def record(config: Config, summary: dict[str, Any]) -> None:
     number = TABLES[config.scenario]
     tables = json.loads((repository.RESULTS / "source_tables.json").read_text(encoding="utf-8"))
     source = tables[number]["rows"][config.model]
-    model = config.model if config.reading == "tuned" else f"{config.model} literal"
+    model = config.model if config.reading == "tuned" else f"{config.model} {config.reading}"
     rows = [
         {"row": f"Scenario {config.scenario}", "model": model, "metric": metric,
          "unit": UNITS.get(metric, "%"), **values,

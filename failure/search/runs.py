@@ -9,11 +9,11 @@ from pathlib import Path
 import jax
 import numpy as np
 
+from failure.identities import identity_of
 from failure.models.gp import GPParams
 from failure.search import bayesopt, storage, trees
 from failure.search.bayesopt import SearchConfig, SearchState, Surrogate
 from failure.search.evaluation import Simulate, check_worked, evaluate
-from failure.search.storage import identity_of
 from failure.search.task import sign_of
 
 

@@ -14,8 +14,8 @@ from typing import Any, TypeVar
 import jax
 import numpy as np
 
+from failure.identities import identity_of
 from failure.search.evaluation import AnswerError, Simulate
-from failure.search.storage import identity_of
 from failure.simulators.processes import SimulatorError
 
 T = TypeVar("T")

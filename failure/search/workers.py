@@ -10,12 +10,12 @@ from typing import NamedTuple
 
 import numpy as np
 
+from failure.identities import identity_of
 from failure.search import bayesopt, storage
 from failure.search.evaluation import Evaluated, Simulate, check_worked, evaluate
 from failure.search.history import SearchState
 from failure.search.methods import METHODS, SearchConfig
 from failure.search.runs import load
-from failure.search.storage import identity_of
 from failure.search.task import sign_of
 
 

@@ -20,6 +20,7 @@ from typing import Any, Protocol
 
 import numpy as np
 
+from failure.identities import identity_of
 from failure.simulators.batches import Batch
 from failure.simulators.processes import Group, SimulatorError, end_group
 from failure.status import Status
@@ -118,8 +119,9 @@ class FunctionSimulator:
     """A Python function `f(x [d]) -> m numbers` as a simulator.
 
     Each of the `workers` is a process of its own, so the function must be importable (a top-level
-    function of a module), and one that hangs is killed after `timeout` seconds. `version` belongs
-    to the cache key: change it when the function changes.
+    function of a module, or a `functools.partial` of one), and one that hangs is killed after
+    `timeout` seconds. The cache key is the function's name with what a partial adds to it
+    (`failure.identities.identity_of`), and `version`: change it when the function changes.
 
     Raises:
         ValueError: settings out of range.
@@ -143,7 +145,6 @@ class FunctionSimulator:
     retry_failed: bool = False
 
     def __post_init__(self) -> None:
-        name = f"{self.function.__module__}.{self.function.__qualname__}"
         self._batch = Batch(
             self.n_specs,
             self.workers,
@@ -151,7 +152,7 @@ class FunctionSimulator:
             self.timeout,
             self.cache,
             self.retry_failed,
-            f"function {name} version {self.version}",
+            f"function {identity_of(self.function)} version {self.version}",
         )
 
     def __call__(self, x: np.ndarray) -> tuple[np.ndarray, np.ndarray]:

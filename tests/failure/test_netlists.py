@@ -9,7 +9,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from failure.search.storage import identity_of
+from failure.identities import identity_of
 from failure.simulators import SimulatorError, netlist_simulator
 from failure.simulators.corners import Corner, pvt_corners
 from failure.simulators.deck import parse_deck, read_deck

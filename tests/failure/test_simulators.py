@@ -4,6 +4,7 @@ import json
 import sys
 import time
 import types
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -158,6 +159,22 @@ def test_function_in_worker_processes(tmp_path: Path) -> None:
     assert "singular matrix" in simulate.messages[1]
     simulate(x)
     assert simulate.simulations == 3
+
+
+def scaled_total(row: np.ndarray, factor: float = 1.0) -> list[float]:
+    return [factor * float(row.sum())]
+
+
+def test_a_partial_runs_and_is_cached_under_its_arguments(tmp_path: Path) -> None:
+    x = np.array([[1.0, 2.0]])
+    for factor, simulations in ((2.0, 1), (3.0, 1), (2.0, 0)):
+        simulate = FunctionSimulator(partial(scaled_total, factor=factor), 1, cache=tmp_path)
+        specs, status = simulate(x)
+        assert status.tolist() == [GOOD] and specs.tolist() == [[3.0 * factor]]
+        assert simulate.simulations == simulations
+    # The name of a plain function is what it was: caches on the disk stay good.
+    plain = FunctionSimulator(scaled_total, 1)._batch.identity
+    assert f"function {__name__}.scaled_total version 1" in plain
 
 
 def test_a_function_that_no_process_can_import_is_an_error_and_not_a_wait(monkeypatch) -> None:

@@ -7,9 +7,10 @@ from functools import partial
 import numpy as np
 import pytest
 
+from failure.identities import identity_of
 from failure.search import runs
 from failure.search.methods import SearchConfig
-from failure.search.storage import identity_of, samples
+from failure.search.storage import samples
 from failure.search.task import Task
 from failure.search.trees import load_tree, save_tree
 from failure.simulators import SimulatorError

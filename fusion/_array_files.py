@@ -17,6 +17,8 @@ import numpy as np
 def write_arrays(path: Path, header: Mapping[str, Any], arrays: Mapping[str, np.ndarray]) -> None:
     """Write an `.npz`; a reader sees the old file or the new one."""
     text = np.frombuffer(json.dumps(header).encode(), np.uint8)
+    if path.is_dir():
+        raise ValueError(f"path={str(path)!r}: expected a file, not a folder; add a name")
     path.parent.mkdir(parents=True, exist_ok=True)
     handle, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
     try:
@@ -35,13 +37,18 @@ def read_arrays(path: Path) -> tuple[dict[str, Any], dict[str, np.ndarray]]:
         FileNotFoundError: it is not there.
         ValueError: it is no such file.
     """
-    with np.load(path, allow_pickle=False) as file:
-        if "header" not in file:
-            raise ValueError(
-                f"path={str(path)!r}: expected a file of FittedARGate.save; check the path"
-            )
-        held = {name: file[name] for name in file.files}
-    return json.loads(held.pop("header").tobytes()), held
+    if not path.exists():
+        raise FileNotFoundError(f"path={str(path)!r}: expected a file; there is none, check it")
+    try:
+        # A stream of our own, since numpy leaves that of a damaged file open.
+        with path.open("rb") as stream, np.load(stream, allow_pickle=False) as file:
+            held = {name: file[name] for name in file.files}
+        return json.loads(held.pop("header").tobytes()), held
+    except Exception:  # numpy says in many ways that a file is none of its own, or cut off
+        raise ValueError(
+            f"path={str(path)!r}: expected a whole file of FittedARGate.save or "
+            "FittedSensors.save; check the path, or save it again"
+        ) from None
 
 
 def flatten(tree: Any, prefix: str = "") -> dict[str, np.ndarray]:

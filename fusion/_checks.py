@@ -98,3 +98,28 @@ def check_key(key: Any, name: str = "key") -> None:
         f"{name}={shown}: expected a typed PRNG key; make it with jax.random.key(seed), or wrap a "
         "legacy key with jax.random.wrap_key_data"
     )
+
+
+def check_array(name: str, value: Any) -> None:
+    """`value` is an array of numbers, traced or not."""
+    if not hasattr(value, "shape"):
+        raise TypeError(
+            f"{name}={type(value).__name__} object: expected an array of numbers; write "
+            f"numpy.asarray({name})"
+        )
+    if np.dtype(value.dtype).kind in "USOMm":
+        raise TypeError(f"{name}.dtype={value.dtype}: expected numbers; convert the readings first")
+
+
+def check_mask(name: str, value: Any, shape: tuple[int, ...], *, numbers: bool = False) -> None:
+    """`value` is an array of this shape, of truth values unless it may hold `numbers`."""
+    check_array(name, value)
+    if tuple(value.shape) != tuple(shape):
+        raise ValueError(
+            f"{name}.shape={tuple(value.shape)}: expected {tuple(shape)}; give one value for each "
+            "sensor of each window"
+        )
+    if not numbers and np.dtype(value.dtype).kind not in "biu":
+        raise TypeError(
+            f"{name}.dtype={value.dtype}: expected True and False; write {name}.astype(bool)"
+        )

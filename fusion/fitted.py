@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Array, Bool, Float, Key
 
 from fusion._array_files import build, flatten, read_arrays, unflatten, write_arrays
-from fusion._checks import check_type
+from fusion._checks import check_mask, check_type
 from fusion.config import ModelConfig
 from fusion.data.dataset import Dataset, Scale, apply_scale
 from fusion.loop import Corruption, test_output
@@ -101,18 +101,20 @@ class FittedARGate:
             available: False for sensors that sent nothing, beside those with NaN.
 
         Raises:
-            TypeError: `x` does not hold numbers.
-            ValueError: wrong shape, other channel names, infinite readings.
+            TypeError: `x` does not hold numbers, `available` no truth values.
+            ValueError: no window, wrong shape, other channel names, infinite readings.
         """
-        raw = np.asarray(x)
-        if raw.dtype.kind not in "fiu":
-            raise TypeError(f"x.dtype={raw.dtype}: expected numbers; convert the readings first")
+        raw = _numbers(x)
         if channels is not None and tuple(channels) != self.channels:
             raise ValueError(
                 f"channels={list(channels)}: expected {list(self.channels)}; put the sensors in "
                 "this order"
             )
         check_windows(self.config, raw)
+        if not len(raw):
+            raise ValueError(
+                f"x.shape={raw.shape}: expected one window or more; leave the call out"
+            )
         if np.isinf(raw).any():
             window, sensor, _ = np.argwhere(np.isinf(raw))[0]
             raise ValueError(
@@ -121,12 +123,9 @@ class FittedARGate:
             )
         absent = np.isnan(raw).any(axis=-1)
         if available is not None:
-            if np.shape(available) != absent.shape:
-                raise ValueError(
-                    f"available.shape={np.shape(available)}: expected {absent.shape}; give one "
-                    "value for each sensor of each window"
-                )
-            absent |= ~np.asarray(available, bool)
+            there = np.asarray(available)
+            check_mask("available", there, absent.shape)
+            absent |= ~there.astype(bool)
         scaled = apply_scale(raw, self.scale)
         scaled = np.where(absent[:, :, None], np.float32(np.nan), scaled)
         arrays = classify(
@@ -160,13 +159,14 @@ class FittedARGate:
 
         Raises:
             FileNotFoundError: it is not there.
-            ValueError: it is no such file, or one of a later version.
+            ValueError: it is no such file, or one of another version.
         """
         header, held = read_arrays(Path(path))
         if header["format"] != FORMAT:
             raise ValueError(
                 f"path={str(path)!r} of format {header['format']}: expected format {FORMAT}; "
-                "install the version that wrote it"
+                "read one of sensors of unequal shapes with FittedSensors.load, or install the "
+                "version that wrote it"
             )
         parts: dict[str, dict[str, np.ndarray]] = {"params": {}, "monitor": {}, "scale": {}}
         for name, value in held.items():
@@ -182,6 +182,20 @@ class FittedARGate:
             false_alarm_rate=header["false_alarm_rate"],
             temperature=header["temperature"],
         )
+
+
+def _numbers(x: Any) -> np.ndarray:
+    """Readings as an array."""
+    try:
+        raw = np.asarray(x)
+    except ValueError:
+        raise ValueError(
+            "x=sequences of unequal length: expected windows [batch, sensor, time] of one length; "
+            "cut them to it"
+        ) from None
+    if raw.dtype.kind not in "fiu":
+        raise TypeError(f"x.dtype={raw.dtype}: expected numbers; convert the readings first")
+    return raw
 
 
 def finish(
@@ -209,7 +223,7 @@ def finish(
 
     Raises:
         ValueError: the network and the data set disagree in shape.
-        TypeError: `data` is no data set.
+        TypeError: `data` is no data set, `state` no `TrainState`, `noise` no `Corruption`.
     """
     check_type("data", data, Dataset, "give validation_split(data)")
     output = test_output(model, state, data, noise, key=key)

@@ -140,10 +140,16 @@ def fit(
     Raises:
         TrainingDiverged: the loss is not finite; the last finite state has been saved.
         ValueError: model and data set disagree in shape; checkpoints are there and `resume` is
-            not set; `resume` is set and the checkpoints have other settings, data or key.
+            not set; `resume` is set without a folder, or the checkpoints have other settings,
+            data or key.
+        TypeError: an argument that is not of its type.
     """
     _check(model, data, noise)
+    check_type("train", train, TrainConfig, "make it with fusion.TrainConfig")
+    check_type("hyper", hyper, HyperParams, "make it with fusion.HyperParams")
     check_key(key)
+    if resume and checkpoint_dir is None:
+        raise ValueError("resume=True: expected checkpoint_dir with it; give the run's folder")
     check_count("checkpoint_every", checkpoint_every)
     check_number("checkpoint_minutes", checkpoint_minutes, 0.0, fix="0 saves every epoch")
     init_key, epoch_key, noise_key = (jax.random.fold_in(key, i) for i in range(3))
@@ -220,8 +226,10 @@ def test_output(
 
     Raises:
         ValueError: an unknown kind, or the network and the data set disagree in shape.
+        TypeError: an argument that is not of its type, such as a `FitResult` for its state.
     """
     _check(model, data, noise)
+    check_type("state", state, TrainState, "give fit(...).state")
     check_key(key)
     if kind is not None:
         check_kinds("kind", kind)
@@ -237,6 +245,9 @@ TestOutput.__test__ = False  # type: ignore[attr-defined]
 
 
 def _check(model: ModelConfig, data: Dataset, noise: Corruption) -> None:
+    check_type("model", model, ModelConfig, "make it with fusion.ModelConfig or fusion.preset")
+    check_type("data", data, Dataset, "make it with fusion.load or fusion.from_arrays")
+    check_type("noise", noise, Corruption, "make it with fusion.Corruption")
     for name, given, found in (
         ("n_sensors", model.n_sensors, data.n_channels),
         ("n_times", model.n_times, data.n_time),

@@ -14,7 +14,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from fusion._checks import check_key
+from fusion._checks import check_array, check_key, check_mask
 from fusion.bayesian_gate import VariationalGate
 from fusion.config import ModelConfig
 from fusion.encoders import encoder
@@ -230,16 +230,19 @@ def predict(
         check_key(key)
     check_windows(config, x)
     for name, mask in (("failed", failed), ("available", available), ("weights", weights)):
-        if mask is not None and mask.shape != x.shape[:2]:
-            raise ValueError(
-                f"{name}.shape={tuple(mask.shape)}: expected {tuple(x.shape[:2])}; give one value "
-                "for each sensor of each window"
-            )
+        if mask is not None:
+            check_mask(name, mask, x.shape[:2], numbers=name == "weights")
     if key is None:
         there = ~jnp.any(jnp.isnan(x), axis=-1)
         available = there if available is None else available & there
     if available is not None:
+        available = available.astype(bool)
         x = jnp.where(available[:, :, None], x, jnp.zeros_like(x))
+    if "main" in main:
+        raise ValueError(
+            "main=parameters with auxiliary paths: expected those of the main model; take "
+            "export(state.params)"
+        )
     main, memory = read_memory(main)
     if config.head == "neighbourhood" and memory is None:
         raise ValueError(
@@ -256,7 +259,9 @@ def check_windows(config: ModelConfig, x: Any) -> None:
 
     Raises:
         ValueError: no batch axis, times before sensors, or other numbers of sensors or samples.
+        TypeError: no array, or one of texts.
     """
+    check_array("x", x)
     k, t = config.n_sensors, config.n_times
     if x.ndim == 3 and x.shape[1:] == (k, t):
         return

@@ -6,6 +6,7 @@ from typing import Any
 
 import numpy as np
 
+from fusion._checks import check_type
 from fusion.fitted import FittedARGate, Prediction
 
 
@@ -25,6 +26,7 @@ class SensorStream:
     """
 
     def __init__(self, fitted: FittedARGate) -> None:
+        check_type("fitted", fitted, FittedARGate, "read a file with FittedARGate.load")
         self._fitted = fitted
         shape = (1, fitted.config.n_sensors, fitted.config.n_times)
         self._window = np.full(shape, np.nan)
@@ -46,14 +48,29 @@ class SensorStream:
             the first window is full.
 
         Raises:
-            ValueError: another number of sensors, or an infinite reading.
+            ValueError: another number of sensors, or an infinite reading; the stream goes on as if
+                the sample had not come.
+            TypeError: no numbers.
         """
-        row = np.asarray(sample, np.float64)
+        try:
+            row = np.asarray(sample, np.float64)
+        except (TypeError, ValueError):
+            raise TypeError(
+                f"sample={sample!r}: expected one number for each sensor; give NaN for a sensor "
+                "that sent nothing"
+            ) from None
         k = self._window.shape[1]
         if row.shape != (k,):
             raise ValueError(
                 f"sample.shape={row.shape}: expected ({k},), one reading of each of "
                 f"{list(self._fitted.channels)}; give NaN for a sensor that sent nothing"
+            )
+        if np.isinf(row).any():
+            # Refused before it is in the window, where it would spoil every answer of its time.
+            sensor = int(np.argmax(np.isinf(row)))
+            raise ValueError(
+                f"sample[{sensor}]={row[sensor]}: expected a finite reading of "
+                f"{self._fitted.channels[sensor]!r}; give NaN for one that is lost"
             )
         self._window[0, :, :-1] = self._window[0, :, 1:]
         self._window[0, :, -1] = row

@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from fusion._checks import check_number
+from fusion._checks import check_count, check_number
 from fusion.data.dataset import Dataset, apply_scale, check_dataset, draw_groups, fit_scale
 
 
@@ -45,6 +45,8 @@ def _windows(x: Any, channels: Sequence[str] | None) -> np.ndarray:
 
 def _labels(y: Any, n: int, classes: Sequence[str] | None) -> tuple[np.ndarray, tuple[str, ...]]:
     array = np.asarray(y)
+    if array.dtype.kind == "O" and all(isinstance(label, str) for label in array.flat):
+        array = array.astype(str)  # as a table's column of names comes
     if array.shape != (n,):
         raise ValueError(f"y.shape={array.shape}: expected ({n},); give one label for each window")
     if array.dtype.kind in "US":
@@ -58,7 +60,13 @@ def _labels(y: Any, n: int, classes: Sequence[str] | None) -> tuple[np.ndarray, 
             f"y.dtype={array.dtype}: expected class numbers or names; write y.astype(int) if they "
             "are whole"
         )
-    count = int(array.max()) + 1
+    present = set(array.tolist())
+    count = max(present) + 1
+    if min(present) < 0 or (classes is None and len(present) < count):
+        raise ValueError(
+            f"y=class numbers {sorted(present)[:8]}: expected 0, 1, 2 ... without gaps; write "
+            "numpy.unique(y, return_inverse=True)[1], or give them as names"
+        )
     names = tuple(map(str, range(count))) if classes is None else tuple(classes)
     return array.astype(np.int32), names
 
@@ -101,6 +109,7 @@ def from_arrays(
         ((30, 3, 8), ('a', 'b'))
     """
     check_number("test_fraction", test_fraction, 0.0, 1.0, above=True, below=True)
+    check_count("seed", seed, 0)
     windows = _windows(x, channels)
     n, k, _ = windows.shape
     names = tuple(f"sensor_{i}" for i in range(k)) if channels is None else tuple(channels)
@@ -117,6 +126,11 @@ def from_arrays(
                 f"groups.shape={np.shape(groups)}: expected ({n},); give one for each window"
             )
         held = np.isin(group, draw_groups(group, labels, fraction=test_fraction, seed=seed))
+    if held.all():
+        raise ValueError(
+            f"test_fraction={test_fraction}: expected some of {n} windows left for training; "
+            "lower it, or give more windows"
+        )
     scale = fit_scale(windows[~held], names)
     parts = {
         f"{part}_{field}": array[rows]

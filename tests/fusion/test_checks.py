@@ -14,14 +14,16 @@ from typing import Any
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 import pytest
 
 import fusion
 from fusion import failures, gating, models
 from fusion.config import HyperParams, ModelConfig, TrainConfig
 from fusion.data.dataset import check_dataset
-from fusion.loop import Corruption
+from fusion.loop import Corruption, FitResult
 from fusion.losses import LossConfig, LossParams
+from fusion.streaming import SensorStream
 from fusion.targets import TargetConfig
 
 CHANNELS = ("a", "b", "c")
@@ -29,6 +31,20 @@ CLEAN = failures.no_failure(CHANNELS)
 X = jnp.zeros((4, 3, 2))
 DATA = fusion.load("simulated")
 KEY = jax.random.key(0)
+SMALL = ModelConfig(n_sensors=3, n_times=2)
+FITTING: dict[str, Any] = {
+    "model": ModelConfig(n_sensors=6, n_times=32, n_classes=4),
+    "train": TrainConfig(),
+    "hyper": HyperParams(),
+    "data": DATA,
+    "noise": Corruption(*[failures.no_failure(DATA.channels)] * 2),
+    "key": KEY,
+}
+
+
+def fit(**changes: Any) -> Any:
+    return fusion.fit(**(FITTING | changes))
+
 
 WRONG: dict[str, Callable[[], Any]] = {
     "model='argate': expected one of": lambda: ModelConfig("argate"),
@@ -99,6 +115,10 @@ WRONG: dict[str, Callable[[], Any]] = {
     "protocol.n_channels=3: expected 9": lambda: fusion.make_train(
         ModelConfig(), TrainConfig(), 64, CLEAN
     ),
+    "resume=True: expected checkpoint_dir": lambda: fit(resume=True),
+    "main=parameters with auxiliary paths: expected": lambda: models.predict(
+        SMALL, {"main": {}, "aux": {}}, X
+    ),
 }
 
 
@@ -112,6 +132,22 @@ WRONG_TYPES: dict[str, Callable[[], Any]] = {
         dataclasses.replace(DATA, train_y=[0, 1])
     ),
     "encoder=NoneType object: expected EncoderConfig": lambda: ModelConfig(encoder=None),
+    "model=str object: expected ModelConfig": lambda: fit(model="argate_l"),
+    "data=NoneType object: expected Dataset": lambda: fit(data=None),
+    "noise=NoneType object: expected Corruption": lambda: fit(noise=None),
+    "hyper=float object: expected HyperParams": lambda: fit(hyper=1e-3),
+    "state=FitResult object: expected TrainState; give": lambda: fusion.test_output(
+        FITTING["model"], FitResult(None, []), DATA, FITTING["noise"], key=KEY
+    ),
+    "x=list object: expected an array of numbers": lambda: models.predict(SMALL, {}, X.tolist()),
+    "x.dtype=<U1: expected numbers": lambda: models.predict(SMALL, {}, np.full(X.shape, "a")),
+    "available=list object: expected an array": lambda: models.predict(
+        SMALL, {}, X, available=[[True] * 3] * 4
+    ),
+    "available.dtype=float32: expected True and False": lambda: models.predict(
+        SMALL, {}, X, available=jnp.ones((4, 3))
+    ),
+    "fitted=str object: expected FittedARGate": lambda: SensorStream("net.npz"),
 }
 
 

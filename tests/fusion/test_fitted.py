@@ -145,8 +145,17 @@ def test_a_saved_network_is_the_same_network(fitted: FittedARGate, tmp_path: Pat
     for a, b in zip(again.predict(RAW), fitted.predict(RAW), strict=True):
         np.testing.assert_array_equal(a, b)
     np.savez(tmp_path / "other.npz", a=np.ones(2))
-    with pytest.raises(ValueError, match=r"expected a file of FittedARGate\.save"):
-        FittedARGate.load(tmp_path / "other.npz")
+    whole = path.read_bytes()
+    (tmp_path / "half.npz").write_bytes(whole[: len(whole) // 2])
+    (tmp_path / "text.npz").write_text("no arrays")
+    np.save(tmp_path / "array.npy", RAW)
+    for name in ("other.npz", "half.npz", "text.npz", "array.npy", "deep"):
+        with pytest.raises(ValueError, match=rf"{name}'.*a whole file of FittedARGate\.save"):
+            FittedARGate.load(tmp_path / name)
+    with pytest.raises(FileNotFoundError, match=r"none.npz'.*there is none, check it"):
+        FittedARGate.load(tmp_path / "none.npz")
+    with pytest.raises(ValueError, match="expected a file, not a folder"):
+        fitted.save(tmp_path)
 
 
 def test_what_is_not_a_batch_of_windows_is_refused(fitted: FittedARGate) -> None:
@@ -160,6 +169,10 @@ def test_what_is_not_a_batch_of_windows_is_refused(fitted: FittedARGate) -> None
         (infinite, {}, ValueError, r"x\[1, 2\]=window with infinity.*'kelvin'"),
         (RAW, {"channels": ("bar", "volts", "kelvin")}, ValueError, r"put the sensors in this"),
         (RAW, {"available": np.ones(3, bool)}, ValueError, r"available.shape=\(3,\)"),
+        (RAW, {"available": [["yes", "no", "no"]] * 3}, TypeError, r"available.dtype=<U3"),
+        (RAW, {"available": np.full((3, 3), np.nan)}, TypeError, r"True and False"),
+        (RAW[:0], {}, ValueError, r"expected one window or more"),
+        ([[[5.0], [1e5, 1e5], [300.0]]], {}, ValueError, r"sequences of unequal length"),
     ):
         with pytest.raises(kind, match=message):
             fitted.predict(x, **options)

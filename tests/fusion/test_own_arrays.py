@@ -18,6 +18,8 @@ NAMES = ("gyro", "accel", "sound")
 
 def test_names_numbers_and_groups() -> None:
     data = from_arrays(X, ["walk", "rest"] * 20, channels=NAMES)
+    column = np.array(["walk", "rest"] * 20, object)  # as a table's column comes
+    assert (from_arrays(X, column).train_y == data.train_y).all()
     assert data.classes == ("rest", "walk") and data.train_y[:1].dtype == np.int32
     assert data.train_x.shape == (30, 3, 8) and np.abs(data.train_x).max() == 1.0
     grouped = from_arrays(X, Y, groups=[f"person {i // 5}" for i in range(40)])
@@ -41,6 +43,11 @@ def test_names_numbers_and_groups() -> None:
         (X, Y, {"groups": [0]}, r"groups.shape=\(1,\): expected \(40,\)"),
         (X, Y, {"test_fraction": 1.0}, r"test_fraction=1.0: expected a number in \(0, 1\)"),
         (np.where(X > 2, np.nan, X), Y, {}, r"window with NaN or infinity"),
+        (X, Y + 1, {}, r"y=class numbers \[1, 2\]: .*return_inverse"),
+        (X, 2 * Y - 1, {}, r"y=class numbers \[-1, 1\]: .*return_inverse"),
+        (X, 2 * Y, {}, r"y=class numbers \[0, 2\]: .*without gaps"),
+        (X, Y, {"seed": -1}, r"seed=-1: expected a whole number of at least 0"),
+        (X[:1], Y[:1], {"classes": ("a", "b")}, r"some of 1 windows left for training"),
     ],
 )
 def test_what_does_not_fit_is_named(x, y, options: dict, message: str) -> None:

@@ -48,6 +48,23 @@ def test_a_sample_of_another_length_is_refused(fitted: FittedARGate) -> None:
         SensorStream(fitted).push([0.0, 1.0])
 
 
+def test_a_sample_that_is_refused_leaves_no_trace(fitted: FittedARGate) -> None:
+    k, t = fitted.config.n_sensors, fitted.config.n_times
+    recording = np.random.default_rng(0).normal(size=(t, k))
+    stream, clean = SensorStream(fitted), SensorStream(fitted)
+    for sample in recording[:-1]:
+        assert stream.push(sample) is None and clean.push(sample) is None
+    broken = recording[0].copy()
+    broken[1] = np.inf
+    with pytest.raises(ValueError, match=r"sample\[1\]=inf: expected a finite reading of"):
+        stream.push(broken)
+    with pytest.raises(TypeError, match="expected one number for each sensor"):
+        stream.push(["a"] * k)
+    answer, expected = stream.push(recording[-1]), clean.push(recording[-1])
+    assert answer is not None and expected is not None
+    assert np.array_equal(answer.probabilities, expected.probabilities)
+
+
 READER = """
 import sys, numpy as np
 import jax

@@ -16,8 +16,17 @@ import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float
 
 from fusion.gating import Fusion, Gate, Normalizer, Scaling, apply_weights, available_weights
+from fusion.lattice import project_tree
+from fusion.lattice.deep_lattice import DeepLatticeParams
+from fusion.lattice.tagged import Tagged
 from fusion.losses import LossConfig, LossParams, LossTerms, cross_entropy, gate_penalty
-from fusion.targets import TargetConfig, apply_targets, init_targets, project_targets
+from fusion.targets import (
+    TargetConfig,
+    apply_targets,
+    init_targets,
+    lattice_config,
+    project_targets,
+)
 
 
 class ARGateOutput(NamedTuple):
@@ -39,8 +48,8 @@ class ARGateOutput(NamedTuple):
 class LatticeTargets(nn.Module):
     """The monotone lattice networks of Equation 3.2 as a module: losses in, targets out.
 
-    `[batch, sensor] -> [batch, sensor]`; its parameters must be projected after every step, see
-    `project_argate`.
+    `[batch, sensor] -> [batch, sensor]`; its parameters must be projected after every step: they
+    are tagged, so that `fusion.lattice.with_projection(optimizer)` does it, or `project_argate`.
 
     Attributes:
         config: sizes of the networks.
@@ -54,8 +63,14 @@ class LatticeTargets(nn.Module):
     def __call__(self, losses: Float[Array, "b k"]) -> Float[Array, "b k"]:
         """Return the fusion-weight targets of every example."""
         n_sensors = losses.shape[-1]
-        params = self.param("fusion_targets", lambda key: init_targets(key, self.config, n_sensors))
+        params: Any = self.param("fusion_targets", self._tagged, n_sensors)
         return apply_targets(self.config, params, losses)
+
+    def _tagged(self, key: Array, n_sensors: int) -> Tagged:
+        if not jnp.issubdtype(key.dtype, jax.dtypes.prng_key):
+            key = jax.random.wrap_key_data(key)  # the legacy key that many flax programs pass
+        networks = init_targets(key, self.config, n_sensors)
+        return Tagged(networks, lattice_config(self.config, n_sensors), axes=(0,))
 
 
 class ARGate(nn.Module):
@@ -210,7 +225,9 @@ class ARGateLoss(nn.Module):
 
 
 def project_argate(config: TargetConfig, params: Any) -> Any:
-    """Parameters whose lattice targets, at any depth, are monotone again; the others unchanged.
+    """Parameters whose lattice targets, at any depth of any tree, are monotone again.
+
+    Other tagged layers of `fusion.lattice` are projected, too; all else is unchanged.
 
     To be applied after every step of the optimizer on the parameters of a network with
     `LatticeTargets`, whose `config` is given.
@@ -222,10 +239,14 @@ def project_argate(config: TargetConfig, params: Any) -> Any:
         >>> jax.tree.structure(same) == jax.tree.structure(params)
         True
     """
-    if not isinstance(params, dict):
-        return params
-    projected = {}
-    for name, tree in params.items():
-        targets = name == "fusion_targets"
-        projected[name] = project_targets(config, tree) if targets else project_argate(config, tree)
-    return projected
+
+    def one(path: Any, node: Any) -> Any:
+        if isinstance(node, Tagged):
+            return project_tree(node)
+        # Without their tag, as after `nn.unbox`, they are known by name.
+        named = path and getattr(path[-1], "key", None) == "fusion_targets"
+        return project_targets(config, node) if named else node
+
+    return jax.tree_util.tree_map_with_path(
+        one, params, is_leaf=lambda node: isinstance(node, Tagged | DeepLatticeParams)
+    )

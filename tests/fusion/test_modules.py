@@ -10,7 +10,9 @@ import jax.numpy as jnp
 import numpy as np
 import optax
 import pytest
+from flax.core import freeze
 
+from fusion.lattice import check_tree, with_projection
 from fusion.losses import LossConfig, LossParams, argate_loss, cross_entropy
 from fusion.modules import ARGate, ARGateLoss, LatticeTargets, project_argate
 from fusion.targets import TargetConfig, check_targets
@@ -71,12 +73,34 @@ def test_training_with_any_encoders_keeps_the_lattice_monotone() -> None:
         params, state, value = step(params, state)
         values.append(float(value))
     assert values[-1] < 0.5 * values[0]
-    lattice = params["model"]["targets"]["fusion_targets"]
+    lattice = params["model"]["targets"]["fusion_targets"].value
     assert float(check_targets(LATTICE, lattice)) == 0.0
     # The network alone, without its loss; the noisy sensor weighs less where it is noise.
     out = network(LatticeTargets(LATTICE)).apply({"params": params["model"]}, readings)
     assert (out.output.argmax(1) == labels).mean() > 0.97
     assert out.weights[1::2, 1].mean() < out.weights[::2, 1].mean()
+
+
+@pytest.mark.parametrize("how", ["with_projection", "MultiSteps", "frozen", "unboxed"])
+def test_lattice_targets_are_projected_in_any_tree(how: str) -> None:
+    targets = LatticeTargets(LATTICE)
+    losses = jnp.zeros((1, 3))
+    # A legacy key, as many flax programs pass it.
+    params = {"deep": [targets.init(jax.random.PRNGKey(0), losses)["params"]], "rest": jnp.ones(2)}
+    broken = jax.tree.map(lambda a: a + jax.random.normal(jax.random.key(1), a.shape), params)
+    assert float(check_tree(broken)) > 0.1
+    if how == "frozen":
+        moved = project_argate(LATTICE, freeze(broken))["deep"][0]["fusion_targets"].value
+    elif how == "unboxed":
+        moved = project_argate(LATTICE, nn.unbox(broken))["deep"][0]["fusion_targets"]
+    else:
+        optimizer = with_projection(optax.sgd(1.0))
+        if how == "MultiSteps":
+            optimizer = optax.MultiSteps(optimizer, 1)
+        slopes = jax.tree.map(jnp.subtract, params, broken)
+        updates, _ = optimizer.update(slopes, optimizer.init(params), params)
+        moved = optax.apply_updates(params, updates)["deep"][0]["fusion_targets"].value
+    assert float(check_targets(LATTICE, moved)) == 0.0
 
 
 def test_the_loss_is_that_of_the_functions() -> None:

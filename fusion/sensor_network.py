@@ -87,6 +87,18 @@ class SensorEncoder(nn.Module):
         return nn.relu(nn.Dense(self.features, name="out")(h))
 
 
+def fusion_of(config: FolderConfig, n_sensors: int, n_outputs: int, *, training: bool) -> ARGate:
+    """The network, with auxiliary heads and targets where `training` needs them."""
+    heads = n_sensors if training and config.loss.auxiliary else 0
+    return ARGate(
+        tuple(SensorEncoder(config.features) for _ in range(n_sensors)),
+        nn.Sequential([nn.Dense(config.width), nn.relu, nn.Dense(n_outputs)]),
+        tuple(nn.Dense(n_outputs) for _ in range(heads)),
+        LatticeTargets() if training and config.loss.learned_targets else None,
+        gate_width=config.width,
+    )
+
+
 def network(config: FolderConfig, data: SensorFolder) -> ARGateLoss:
     """The network with its loss; parameters of the network alone are under `model`.
 
@@ -94,15 +106,7 @@ def network(config: FolderConfig, data: SensorFolder) -> ARGateLoss:
     squared error of its scaled numbers, or the cross entropy of its labels, the mean over columns.
     """
     n_outputs = len(data.names)
-    sensors = range(len(data.sensors))
-    loss = config.loss
-    model = ARGate(
-        tuple(SensorEncoder(config.features) for _ in sensors),
-        nn.Sequential([nn.Dense(config.width), nn.relu, nn.Dense(n_outputs)]),
-        tuple(nn.Dense(n_outputs) for _ in sensors) if loss.auxiliary else (),
-        LatticeTargets() if loss.learned_targets else None,
-        gate_width=config.width,
-    )
+    model = fusion_of(config, len(data.sensors), n_outputs, training=True)
     weights = data.class_weights
     weights = np.ones(n_outputs, np.float32) if weights is None else weights
 
@@ -113,7 +117,7 @@ def network(config: FolderConfig, data: SensorFolder) -> ARGateLoss:
             return jnp.mean((out - target) ** 2, axis=-1)
         return jnp.mean(optax.sigmoid_binary_cross_entropy(out, target), axis=-1)
 
-    return ARGateLoss(model, loss, task_loss)
+    return ARGateLoss(model, config.loss, task_loss)
 
 
 def corrupt_sensors(

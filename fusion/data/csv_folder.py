@@ -14,7 +14,7 @@ from __future__ import annotations
 import csv
 import dataclasses
 import json
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any, Literal, get_args
 
@@ -106,7 +106,24 @@ def load_folder(path: str | Path, *, seed: int = 0, validation: bool = False) ->
     used = np.ones(len(ids), bool)
     if validation:
         used, held = ~held, _draw(groups, raw, ~held, seed + 1)
-    return _assemble(schema, names, np.asarray(ids), found, raw, used & ~held, held)
+    return assemble(schema, names, np.asarray(ids), found, raw, used & ~held, held)
+
+
+def read_windows(
+    path: str | Path, sensors: Mapping[str, Sequence[str]]
+) -> tuple[list[str], list[np.ndarray]]:
+    """Windows of a folder in their own units, for a network that is there already.
+
+    Args:
+        path: folder with `rows.csv`, of which `id` is read, and one CSV file for each sensor.
+        sensors: their names and channels, as in the schema of the network.
+
+    Returns:
+        Ids of the rows, and for each sensor `[row, channel, sample]`, NaN where it is absent.
+    """
+    folder = Path(path)
+    ids = [row["id"] for row in _table(folder / "rows.csv", ("id",))]
+    return ids, [_readings(folder / f"{name}.csv", c, ids) for name, c in sensors.items()]
 
 
 def _schema(path: Path) -> dict[str, Any]:
@@ -228,7 +245,7 @@ def _draw(groups: np.ndarray | None, y: np.ndarray, among: np.ndarray, seed: int
     return among & np.isin(groups, ids)
 
 
-def _assemble(
+def assemble(
     schema: dict[str, Any],
     names: tuple[str, ...],
     ids: np.ndarray,
@@ -237,7 +254,18 @@ def _assemble(
     train: np.ndarray,
     test: np.ndarray,
 ) -> SensorFolder:
-    """Scale by the training rows, weigh the classes, part the rows."""
+    """Scale by the training rows, weigh the classes, part the rows.
+
+    Args:
+        schema: `sensors` (names to channels) and `target` (`kind`, `class_weights`).
+        names: of the classes or columns; ids: of the rows.
+        found: windows of each sensor `[row, channel, sample]`, NaN where it is absent.
+        raw: targets of the rows.
+        train, test: which rows are which.
+
+    Raises:
+        ValueError: a sensor, a class or a spread of numbers that the training rows lack.
+    """
     kind, channels = schema["target"]["kind"], tuple(map(tuple, schema["sensors"].values()))
     there = np.stack([~np.isnan(x).any(axis=(1, 2)) for x in found], axis=1)
     scales, scaled = [], []

@@ -57,6 +57,7 @@ def train_folder(config: Config) -> dict[str, Any]:
 
     from fusion import failures, sensor_network
     from fusion.data.csv_folder import load_folder
+    from fusion.fitted_sensors import finish_sensors
     from fusion.losses import LossParams
     from fusion.target_scores import SCORES, target_scores
 
@@ -91,6 +92,7 @@ def train_folder(config: Config) -> dict[str, Any]:
         fitted = sensor_network.fit(
             settings, data, protocol, kind, key=key, params=weigh, on_epoch=show
         )
+    finish_sensors(settings, fitted.params, data).save(out / "model.npz")
     found = sensor_network.run(
         settings, fitted.params, data, protocol, kind, key=jax.random.fold_in(key, 0)
     )
@@ -113,7 +115,7 @@ def train_folder(config: Config) -> dict[str, Any]:
     write_text(out / "predictions.csv", _predictions(data, found))
     for name, value in scores.items():
         print(f"{name:28} {value:8.2f}")
-    print(f"result.json and predictions.csv are in {out}.")
+    print(f"result.json, predictions.csv and the network, model.npz, are in {out}.")
     headline = next(iter(SCORES[data.kind]))
     shown = {name: scores[name] for name in (headline, f"{headline}_corrupted")}
     print_result(data=json.dumps(str(config.data)), model=config.model, **shown)

@@ -1,6 +1,9 @@
-"""The scikit-learn classifier: cloned, grid-searched and piped as others are."""
+"""The scikit-learn estimators: cloned, grid-searched and piped as others are."""
 
 from __future__ import annotations
+
+from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -10,8 +13,10 @@ sklearn = pytest.importorskip("sklearn")
 from sklearn.base import clone  # noqa: E402
 from sklearn.exceptions import NotFittedError  # noqa: E402
 from sklearn.model_selection import cross_val_score  # noqa: E402
+from sklearn.utils.estimator_checks import estimator_checks_generator  # noqa: E402
 
-from fusion.estimator import ARGateClassifier  # noqa: E402
+from fusion.estimator import ARGateClassifier, ARGateRegressor  # noqa: E402
+from fusion.fitted_sensors import FittedSensors  # noqa: E402
 
 pytestmark = pytest.mark.relaxed
 
@@ -44,3 +49,61 @@ def test_scikit_learn_can_use_it() -> None:
         SMALL.predict(X)
     with pytest.raises(ValueError, match="contains NaN"):
         clone(SMALL).fit(np.full_like(X, np.nan), Y)
+
+
+def test_numbers_are_told_in_their_units_with_a_sensor_missing(tmp_path: Path) -> None:
+    rng = np.random.default_rng(1)
+    level = rng.normal(size=400)
+    gain, spread = np.array([1.0, 50.0, 1e-3, 4.0]), np.array([0.2, 10.0, 2e-4, 0.8])
+    windows = level[:, None] * gain + spread * rng.normal(size=(400, 4))
+    windows[:20, 2] = np.nan  # in training, too
+    y = 300.0 + 25.0 * level
+    model = ARGateRegressor(epochs=12, features=6, width=8, learning_rate=1e-2).fit(windows, y)
+    assert model.predict(windows).shape == (400,) and model.score(windows, y) > 0.85
+    gone = windows.copy()
+    gone[:, 1] = np.nan
+    assert model.score(gone, y) > 0.8
+    found = model.predict_sensors(gone)
+    assert not found.available[:, 1].any() and (found.weights[:, 1] == 0).all()
+    model.fitted_.save(tmp_path / "net.npz")
+    again = FittedSensors.load(tmp_path / "net.npz").predict(
+        [gone[:, k, None, None] for k in range(4)]
+    )
+    np.testing.assert_array_equal(again.output, found.output)
+
+
+def test_few_rows_calibrate_at_the_rate_that_they_allow() -> None:
+    small = clone(SMALL).set_params(epochs=1, batch_size=8)
+    model = small.fit(X[:40], Y[:40])
+    assert model.fitted_.false_alarm_rate == 1 / 8
+    with pytest.raises(ValueError, match=r"false_alarm_rate=0\.01: expected at least 1 / 8"):
+        clone(small).set_params(false_alarm_rate=0.01).fit(X[:40], Y[:40])
+
+
+QUICK = (
+    *("check_estimator_cloneable", "check_estimator_tags_renamed", "check_valid_tag_types"),
+    *("check_estimator_repr", "check_no_attributes_set_in_init", "check_estimators_unfitted"),
+)
+"""Checks of scikit-learn that train nothing."""
+
+
+@pytest.mark.parametrize("estimator", [ARGateClassifier(), ARGateRegressor()], ids=["c", "r"])
+def test_checks_of_scikit_learn_pass(estimator: Any) -> None:
+    ran = []
+    for one, check in estimator_checks_generator(estimator):
+        name = getattr(check, "func", check).__name__
+        if name in QUICK:
+            check(one)
+            ran.append(name)
+    assert set(ran) == set(QUICK)
+
+
+@pytest.mark.parametrize("kind", [ARGateClassifier, ARGateRegressor])
+def test_what_is_no_table_of_sensors_is_refused(kind: Any) -> None:
+    numbers = np.arange(400) % 2
+    with pytest.raises(ValueError, match=r"expected .rows, sensors"):
+        kind().fit(np.zeros((400, 2, 2, 2)), numbers)
+    with pytest.raises(ValueError, match="requires y to be passed"):
+        kind().fit(X, None)
+    with pytest.raises(ValueError, match="inconsistent numbers of samples"):
+        kind().fit(X, numbers[:-1])

@@ -11,6 +11,8 @@ from typing import Any
 import pytest
 
 from fusion.data import load
+from fusion.data.csv_folder import read_windows
+from fusion.fitted_sensors import FittedSensors
 from snn_fusion_failure.commands import train_argate
 from snn_fusion_failure.commands.argate_report import printed
 from snn_fusion_failure.commands.argate_runs import Config, build_cases, build_settings
@@ -339,6 +341,11 @@ def test_a_folder_of_csv_files_is_trained_on(tmp_path: Path) -> None:
     assert {line.split(",")[1] for line in lines[1:]} <= {"walk", "run"}
     assert any(line.endswith(",imu") for line in lines)
     assert 0.0 <= summary["scores"]["accuracy_corrupted"] <= 100.0
+    fitted = FittedSensors.load(tmp_path / "run" / "model.npz")
+    ids, windows = read_windows(folder, dict(zip(fitted.sensors, fitted.channels, strict=True)))
+    told = dict(zip(ids, fitted.predict(windows).output.argmax(1), strict=True))
+    whole = [line.split(",") for line in lines[1:] if line.endswith(",")]  # no sensor failed
+    assert whole and all(fitted.names[told[name]] == said for name, said, _ in whole)
 
 
 def test_options_of_equal_windows_are_refused_for_a_folder(tmp_path: Path) -> None:

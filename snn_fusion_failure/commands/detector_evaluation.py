@@ -105,7 +105,9 @@ def evaluate(config: Eval) -> dict[str, Any]:
         np.save(_clean_weights(folder, config), weights)
     # Where nothing failed the picture shows the frame as it is; a failed sensor's is not drawn.
     for i in range(min(config.pictures, len(names))):
-        frame = read_frame(config.data, names[i], part=frame_part(config.split), any_size=True)
+        frame = read_frame(
+            config.data, names[i], part=frame_part(config.split), any_size=True, may_be_dead=True
+        )
         best = _drawn(objects[i])
         plot_bird(frame, best).savefig(out / f"{names[i]}_bird.png", dpi=120)
         plot_image(frame, best).savefig(out / f"{names[i]}_image.png", dpi=120)

@@ -13,14 +13,14 @@ from __future__ import annotations
 
 import dataclasses
 import json
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.commands.detector_evaluation import evaluate
 from snn_fusion_failure.commands.detector_options import Eval, Robustness
 from snn_fusion_failure.commands.detector_runs import cache_folder, run_config, run_folder
-from snn_fusion_failure.runs import provenance, write_json
+from snn_fusion_failure.runs import provenance, to_jsonable, write_json
 
 METRIC = "3d_moderate_r40"
 Cells = Mapping[str, Mapping[str, float]]
@@ -62,15 +62,65 @@ def summarize_cells(clean: float, cells: Cells, baseline: Cells | None = None) -
 
 
 def _prepare(config: Robustness, folder: Path, out: Path) -> Path:
-    """Cache of a corrupted folder, with the anchor sizes of the detector's own."""
+    """Cache of a corrupted folder, with anchor sizes and ground planes of the detector's own."""
     from fusion.detection.learning.cache import open_cache, prepare_cache
 
     made = out / f"cache_{folder.resolve().name}"
     if not (made / "cache.json").exists():
         like = open_cache(cache_folder(config))
-        splits = (config.split,)
-        prepare_cache(folder, made, config.size, splits=splits, like=like, any_size=True)
+        prepare_cache(
+            folder.resolve(), made, config.size, splits=(config.split,), like=like, copies=True,
+            any_size=True,
+        )  # fmt: skip
+    elif (before := open_cache(made).root.resolve()) != folder.resolve():
+        raise ValueError(
+            f"corrupted={folder}: {out} holds results of {before} under this name; give another "
+            "--out, or name the folder otherwise"
+        )
     return made
+
+
+def check_names(corrupted: Sequence[Path]) -> None:
+    """Refuse corrupted folders whose results would be mixed with others.
+
+    Raises:
+        ValueError: two folders of one name, or one that is called like a failure or `clean`.
+    """
+    from fusion.detection.learning.training import FAILURES
+
+    taken = {"clean", *(f"{kind}_{level}" for kind in FAILURES for level in range(1, 6)), *FAILURES}
+    for folder in corrupted:
+        name = folder.resolve().name
+        if name in taken:
+            raise ValueError(
+                f"corrupted={folder}: {name!r} is a failure of the suite, or given twice; name the "
+                "folder otherwise"
+            )
+        taken.add(name)
+
+
+def check_results(out: Path, run: Path, options: Eval) -> None:
+    """Note what the results in `out` are of, or compare with what is noted there.
+
+    Raises:
+        ValueError: they were measured with other options or of another training.
+    """
+    steps = [int(p.name) for p in (run / "checkpoints").glob("*") if p.name.isdigit()]
+    trained = json.loads((run / "config.json").read_text(encoding="utf-8"))["settings"]
+    given = {
+        "data": options.data.resolve(), "split": options.split, "seed": options.seed,
+        "overlap": options.overlap, "trained": trained, "trained_steps": max(steps, default=0),
+    }  # fmt: skip
+    now, path = to_jsonable(given), out / "measured.json"
+    if path.exists():
+        before = json.loads(path.read_text(encoding="utf-8"))
+        for name, value in now.items():
+            if before.get(name, value) != value:
+                raise ValueError(
+                    f"{out} was measured with {name}={before[name]}, not {value}: give another "
+                    "--out, or delete the folder to measure anew"
+                )
+    write_json(path, now)
 
 
 def robustness(config: Robustness) -> dict[str, Any]:
@@ -88,12 +138,16 @@ def robustness(config: Robustness) -> dict[str, Any]:
     held = None
     if config.baseline is not None:
         held = json.loads(config.baseline.read_text(encoding="utf-8"))["cells"]
+    check_names(config.corrupted)
     run = config.run or run_folder(config)
     out = config.out or run / f"robustness_{config.split}"
     plain = Eval(
         config.data, config.model, config.size, config.cache, split=config.split, seed=config.seed,
         run=run, overlap=config.overlap, pictures=0,
     )  # fmt: skip
+
+    model = run_config(run, plain).model
+    check_results(out, run, plain)
 
     def measure(name: str, options: Eval) -> float:
         path = out / name / "result.json"
@@ -117,7 +171,6 @@ def robustness(config: Robustness) -> dict[str, Any]:
     print(f"{'clean':<28}{clean:8.2f}")
     for kind, by_level in cells.items():
         print(f"{kind:<28}" + "".join(f"{value:8.2f}" for value in by_level.values()))
-    model = run_config(run, plain).model
     found = {"model": model, "clean": clean} | summarize_cells(clean, cells, held)
     write_json(out / "robustness.json", found | {"cells": cells, "provenance": provenance()})
     return found

@@ -107,7 +107,12 @@ class Frame(NamedTuple):
 
 
 def read_frame(
-    root: str | Path, name: str, *, part: str = "training", any_size: bool = False
+    root: str | Path,
+    name: str,
+    *,
+    part: str = "training",
+    any_size: bool = False,
+    may_be_dead: bool = False,
 ) -> Frame:
     """Read all files of one frame below `ROOT/training` (or `ROOT/testing`).
 
@@ -116,6 +121,8 @@ def read_frame(
         name: of its files, without suffix.
         part: `training` or `testing`.
         any_size: accept images of other sizes than the benchmark's.
+        may_be_dead: accept what dead sensors read, for corrupted copies of frames: an image of one
+            colour, a scan without points; points with NaN are left out.
 
     Returns:
         Frame: picture, points, calibration, labels and plane (the last two where there are any).
@@ -128,8 +135,12 @@ def read_frame(
     plane = folder / "planes" / f"{name}.txt"
     return Frame(
         name=name,
-        image=read_image(image_path(folder / "image_2", name), any_size=any_size),
-        points=read_points(folder / "velodyne" / f"{name}.bin"),
+        image=read_image(
+            image_path(folder / "image_2", name), any_size=any_size, may_be_dead=may_be_dead
+        ),
+        points=read_points(
+            folder / "velodyne" / f"{name}.bin", drop_invalid=may_be_dead, may_be_dead=may_be_dead
+        ),
         calibration=read_calibration(folder / "calib" / f"{name}.txt"),
         labels=read_labels(folder / "label_2" / f"{name}.txt") if part == "training" else None,
         plane=read_plane(plane) if plane.is_file() else None,

@@ -58,23 +58,29 @@ def _other_layout(data: bytes) -> str:
     return ""
 
 
-def read_points(path: str | Path, *, drop_invalid: bool = False) -> np.ndarray:
+def read_points(
+    path: str | Path, *, drop_invalid: bool = False, may_be_dead: bool = False
+) -> np.ndarray:
     """Read a `velodyne` file: `[N, 4]` float32 x, y, z [m] and reflectance.
 
     Args:
         path: the `.bin` file.
         drop_invalid: leave out points with NaN or inf instead of refusing the file; the caller
             can count them as the difference to the file's size / 16.
+        may_be_dead: accept a file without a point, as of a dead lidar.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file has no point, ends within a point, or holds NaN; or its numbers cannot
-            be metres and reflectances in float32, with what they may be instead.
+        ValueError: (unless `may_be_dead`) the file has no point; it ends within a point, or holds
+            NaN; or its numbers cannot be metres and reflectances in float32, with what they may be
+            instead.
     """
     path = Path(path)
     if not path.is_file():
         raise FileNotFoundError(f"{path} does not exist: expected the lidar scan of this frame")
     data = path.read_bytes()
+    if may_be_dead and not data:
+        return np.zeros((0, 4), np.float32)
     if len(data) == 0 or len(data) % 16:
         raise ValueError(
             f"{path}: {len(data)} bytes, expected a positive multiple of 16 (four float32 a point)"
@@ -92,7 +98,7 @@ def read_points(path: str | Path, *, drop_invalid: bool = False) -> np.ndarray:
                 f"{int(np.argmin(good))}); pass drop_invalid=True to leave them out"
             )
         points = points[good]
-        if not len(points):
+        if not len(points) and not may_be_dead:
             raise ValueError(f"{path}: all {len(good)} points hold NaN or inf")
     return points.copy()
 
@@ -105,13 +111,20 @@ def write_points(path: str | Path, points: np.ndarray) -> None:
     Path(path).write_bytes(points.astype("<f4").tobytes())
 
 
-def read_image(path: str | Path, *, any_size: bool = False) -> np.ndarray:
+def read_image(
+    path: str | Path, *, any_size: bool = False, may_be_dead: bool = False
+) -> np.ndarray:
     """Read an `image_2` file: `[H, W, 3]` uint8 RGB.
+
+    Args:
+        path: of the file.
+        any_size: accept other sizes than the benchmark's.
+        may_be_dead: accept an image of one colour, as of a dead camera.
 
     Raises:
         FileNotFoundError: there is no such file.
-        ValueError: the file is no image, not 8-bit RGB, all of one colour, or (unless `any_size`)
-            of a size that the benchmark does not have.
+        ValueError: the file is no image, not 8-bit RGB, (unless `may_be_dead`) all of one colour,
+            or (unless `any_size`) of a size that the benchmark does not have.
     """
     from PIL import Image, UnidentifiedImageError
 
@@ -137,7 +150,7 @@ def read_image(path: str | Path, *, any_size: bool = False) -> np.ndarray:
             f"{_IMAGE_WIDTH[1]}x{_IMAGE_HEIGHT[1]} (a resized copy no longer fits its calibration; "
             "pass any_size=True for another camera)"
         )
-    if image.min() == image.max():
+    if not may_be_dead and image.min() == image.max():
         raise ValueError(f"{path}: every pixel is {int(image.min())}: an empty image")
     return image
 

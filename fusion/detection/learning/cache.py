@@ -170,24 +170,20 @@ def _anchor_sizes(
 
 
 def _read_frames(
-    root: Path,
     folder: Path,
-    config: DetectorConfig,
     frames: Sequence[tuple[str, str]],
+    make: Callable[[str, str], tuple[Example, dict[str, int | bool]]],
     *,
-    any_size: bool,
     skip_bad: bool,
-    ground: PlaneConfig | None,
     on_frame: Callable[[int, int, str], None] | None,
 ) -> dict[str, Any]:
-    """Write the examples of (part, name); returns counts of what was left out."""
+    """Write what is made of (part, name); returns counts of what was left out."""
     counts: dict[str, Any] = {
         "skipped": {}, "plane_fitted": 0, "points_dropped": 0, "labels_dropped": 0,
     }  # fmt: skip
     for done, (part, name) in enumerate(frames):
         try:
-            frame = read_frame(root, name, part=part, any_size=any_size)
-            example, left_out = make_example(config, frame, ground)
+            example, left_out = make(part, name)
         except (ValueError, FileNotFoundError) as error:
             if not skip_bad:
                 raise
@@ -213,6 +209,7 @@ def prepare_cache(
     splits: Sequence[str] = ("train", "val"),
     add: bool = False,
     like: Cache | None = None,
+    copies: bool = False,
     any_size: bool = False,
     skip_bad: bool = False,
     ground: PlaneConfig | None = None,
@@ -229,6 +226,8 @@ def prepare_cache(
         add: add the lists to the cache that is there, whose lists and anchor sizes stay.
         like: take the anchor sizes of this cache, so that its detectors can be evaluated on these
             frames, such as a corrupted copy of its validation list.
+        copies: the frames are corrupted copies of those of `like`, under the same names: their
+            ground planes are taken from there, and a sensor may be dead.
         any_size: accept images of other sizes than the benchmark's.
         skip_bad: leave out frames that cannot be used, and count them, instead of stopping.
         ground: where ground planes are looked for; the benchmark's car when left out.
@@ -239,8 +238,8 @@ def prepare_cache(
         FileNotFoundError: a folder, list or (unless `skip_bad`) a file of a frame is missing; or
             there is no cache to add to.
         ValueError: (unless `skip_bad`) a frame is damaged; nothing is left of a split; the cache to
-            add to has another size or one of the lists; or `testing`, which has no labels, would
-            have to give the anchor sizes.
+            add to has another size or one of the lists; `copies` without `like`; or `testing`,
+            which has no labels, would have to give the anchor sizes.
     """
     if target not in TARGETS:
         raise ValueError(f"target={target!r}: expected one of {', '.join(TARGETS)}")
@@ -259,6 +258,8 @@ def prepare_cache(
             if held is None
             else f"{folder}: add to a cache, or make one like another, not both"
         )
+    if copies and like is None:
+        raise ValueError("copies=True: expected the cache of the frames themselves; give `like`")
     if held is None and like is None and splits[0] == TESTING:
         raise ValueError(
             f"{folder}: testing frames have no labels to take anchor sizes from: prepare the "
@@ -266,15 +267,16 @@ def prepare_cache(
         )
     found, missing = split_frames(root, splits)
     everything = sorted({(frame_part(split), name) for split in found for name in found[split]})
+
+    def make(part: str, name: str) -> tuple[Example, dict[str, int | bool]]:
+        frame = read_frame(root, name, part=part, any_size=any_size, may_be_dead=copies)
+        plane = None
+        if like is not None and copies:
+            plane = np.asarray(read_example(_example_folder(like.folder, part), name).plane)
+        return make_example(config, frame, ground, plane=plane)
+
     counts = {"missing": missing} | _read_frames(
-        root,
-        folder,
-        config,
-        everything,
-        any_size=any_size,
-        skip_bad=skip_bad,
-        ground=ground,
-        on_frame=on_frame,
+        folder, everything, make, skip_bad=skip_bad, on_frame=on_frame
     )
     kept = {
         split: tuple(n for n in names if _skip_key(frame_part(split), n) not in counts["skipped"])

@@ -121,7 +121,11 @@ def _labelled_boxes(config: DetectorConfig, frame: Frame) -> tuple[np.ndarray, n
 
 
 def make_example(
-    config: DetectorConfig, frame: Frame, ground: PlaneConfig | None = None
+    config: DetectorConfig,
+    frame: Frame,
+    ground: PlaneConfig | None = None,
+    *,
+    plane: np.ndarray | None = None,
 ) -> tuple[Example, dict[str, int | bool]]:
     """Arrays of a frame, and what had to be left out of them.
 
@@ -129,6 +133,8 @@ def make_example(
         config: gives the sizes.
         frame: as read; without a plane file the ground plane is fitted.
         ground: where the plane is looked for; the benchmark's car when left out.
+        plane: the ground of a corrupted copy of a frame, known from the frame itself. The scan is
+            then taken as it is: no plane is fitted or looked at, and no point need be there.
 
     Returns:
         The example and counts: `plane_fitted`, `points_dropped` (in the image, over `max_points`),
@@ -144,12 +150,13 @@ def make_example(
     height, width = frame.image.shape[:2]
     camera = lidar_to_camera(frame.calibration, frame.points[:, :3])
     seen = in_image(*project(frame.calibration, camera), height, width)
-    if not seen.any():
+    if not seen.any() and plane is None:
         raise ValueError(
             f"frame {frame.name}: none of {len(seen)} lidar points lies in the image: wrong "
             "calibration, or axes other than x forward, y left, z up?"
         )
-    plane = _ground(frame, camera, ground or PlaneConfig())
+    fitted = plane is None and frame.plane is None
+    plane = _ground(frame, camera, ground or PlaneConfig()) if plane is None else plane
     x, z = config.bev.x_range, config.bev.z_range
     # A metre more than the area: a failing lidar moves points.
     near = (camera[:, 0] > x[0] - 1) & (camera[:, 0] < x[1] + 1)
@@ -185,7 +192,7 @@ def make_example(
         regions=regions,
     )
     counts = {
-        "plane_fitted": frame.plane is None,
+        "plane_fitted": fitted,
         "points_dropped": dropped,
         "labels_dropped": lost,
     }

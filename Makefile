@@ -16,7 +16,7 @@ PART   ?= $(shell expr $$(git log -1 --format=%ct 2>/dev/null || date +%s) / 864
 export JAX_COMPILATION_CACHE_DIR ?= $(CURDIR)/.cache/jax
 export JAX_PERSISTENT_CACHE_MIN_COMPILE_TIME_SECS ?= 0
 
-.PHONY: help demo report test slow mutate commands lint types docs wheel lowest newer check clean
+.PHONY: help demo report detector test slow mutate commands lint types docs wheel lowest newer check clean
 .DEFAULT_GOAL := help
 
 help:  ## list the commands
@@ -40,6 +40,19 @@ demo: $(VENV)/.run  ## install what a run needs and show the main job, with pict
 
 report: $(VENV)/.run  ## run a small piece of each chapter and write report/index.html
 	$(BIN)/python scripts/studies/reproduce.py --preset quick
+
+# No weights are part of this repository; this makes some. What is there is not made again.
+DETECTOR := $(BIN)/python scripts/train_detector.py
+FRAMES   := --data runs/detector_frames --size small
+NETWORK  := $(FRAMES) --model dense_argate --failures
+detector: $(VENV)/.run  ## simulate frames, train a small detector on them, write it as a program (< 30 CPU-min)
+	@$(BIN)/python $(INSTALL) -e '.[export]'
+	$(BIN)/python scripts/simulate_kitti.py --frames 2400 --val 100 --test 100 --size small --resume \
+	  --out runs/detector_frames
+	test -f runs/detector_frames/cache_small/cache.json || $(DETECTOR) prepare $(FRAMES) --any-size
+	$(DETECTOR) train $(NETWORK) --steps 3000 --resume
+	$(DETECTOR) eval $(NETWORK) --pictures 2
+	$(DETECTOR) export $(NETWORK) --out runs/detector.stablehlo
 
 test: $(VENV)/.dev  ## install what the tests need and run the default suite (<= 15 min on two cores)
 	@echo "== running the default test suite on $(JOBS) workers"

@@ -35,6 +35,9 @@ class Prepare:
     """Leave out damaged frames, and count them, instead of stopping at the first."""
     like: Path | None = None
     """A cache whose anchor sizes are taken, for frames that its detectors are evaluated on."""
+    copies: bool = False
+    """The frames are corrupted copies of those of `--like`: ground planes are taken from there, and
+    a camera or lidar may be dead."""
     target: Literal["Car", "Pedestrian", "Cyclist"] = "Car"
     """Class that detectors of this cache are trained to tell from the background."""
     camera_height: float = 1.65
@@ -128,6 +131,31 @@ class Drive:
 
 
 @dataclasses.dataclass(frozen=True)
+class Export:
+    """A trained run as one file that needs jax and not this package."""
+
+    data: Path
+    """Of the run."""
+    model: ModelOption = "dense_argate"
+    size: SizeOption = "small"
+    cache: Path | None = None
+    seed: int = 0
+    failures: bool = False
+    """The run that was trained with failures (names the folder)."""
+    run: Path | None = None
+    """Run folder; named as in `train` when left out."""
+    image_size: tuple[int, int] | None = None
+    """Rows and columns of the images that it will get; those of the run's first frame when left
+    out."""
+    points: int = 131_072
+    """Rows of its scans; spare ones are NaN."""
+    platforms: tuple[str, ...] = ("cpu",)
+    """Where it is to run, such as `cpu cuda`."""
+    out: Path | None = None
+    """The program; RUN/detector.stablehlo when left out."""
+
+
+@dataclasses.dataclass(frozen=True)
 class Robustness:
     """Average precision of a trained detector by failure and severity, and on corrupted folders."""
 
@@ -152,4 +180,5 @@ class Robustness:
     baseline: Path | None = None
     """A `robustness.json` of the detector that the corruption error (mCE) is measured against."""
     out: Path | None = None
-    """Folder of results; RUN/robustness_SPLIT when left out. What is there is not done again."""
+    """Folder of results; RUN/robustness_SPLIT when left out. What is there is not done again, and
+    refused when it was measured with other options or another training."""

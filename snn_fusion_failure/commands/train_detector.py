@@ -8,6 +8,7 @@
         --failures --failure camera_fog
     python scripts/train_detector.py robustness --data ROOT --model avod_argate --size small \
         --failures
+    python scripts/train_detector.py export --data ROOT --model dense_argate --size small --failures
 
 ROOT is a folder in the layout of KITTI (`training/{image_2,velodyne,calib,label_2,planes}`,
 `ImageSets/{train,val}.txt`), real or from `scripts/simulate_kitti.py`. `prepare` checks them, fits
@@ -17,8 +18,10 @@ curves, pictures from above and of the image, and ends with a line `result: ...`
 takes the frames of ROOT/testing (no labels, hence result files and no score). `robustness` repeats
 `eval` for every failure at severities 1 to 5 and for corrupted copies of the frames
 (`--corrupted`), and prints a table with the mean relative precision (mRA). `drive` simulates a
-drive on which a sensor dies and draws what it reads, what is found and what the gate says. `small`
-is for two CPU cores (minutes), `paper` for an accelerator (see docs/kitti.md).
+drive on which a sensor dies and draws what it reads, what is found and what the gate says. `export`
+writes the trained detector, resizing and maps included, as a StableHLO program that jax runs
+without this package. `small` is for two CPU cores (minutes), `paper` for an accelerator (see
+docs/kitti.md).
 """
 
 from __future__ import annotations
@@ -32,7 +35,15 @@ import tyro
 
 from snn_fusion_failure.commands.detector_drive import drive
 from snn_fusion_failure.commands.detector_evaluation import evaluate
-from snn_fusion_failure.commands.detector_options import Drive, Eval, Prepare, Robustness, Train
+from snn_fusion_failure.commands.detector_export import export
+from snn_fusion_failure.commands.detector_options import (
+    Drive,
+    Eval,
+    Export,
+    Prepare,
+    Robustness,
+    Train,
+)
 from snn_fusion_failure.commands.detector_robustness import robustness
 from snn_fusion_failure.commands.detector_runs import (
     NOT_SETTINGS,
@@ -67,6 +78,7 @@ def prepare(config: Prepare) -> dict[str, Any]:
             splits=config.splits,
             add=config.add or config.splits[:1] == (TESTING,),
             like=open_cache(config.like) if config.like else None,
+            copies=config.copies,
             any_size=config.any_size,
             target=config.target,
             skip_bad=config.skip_bad,
@@ -154,8 +166,8 @@ def train(config: Train) -> dict[str, Any]:
     return result
 
 
-def main(config: Prepare | Train | Eval | Drive | Robustness) -> dict[str, Any]:
-    """Run one of the five commands."""
+def main(config: Prepare | Train | Eval | Drive | Export | Robustness) -> dict[str, Any]:
+    """Run one of the six commands."""
     if isinstance(config, Prepare):
         result = prepare(config)
         shown = result
@@ -164,6 +176,9 @@ def main(config: Prepare | Train | Eval | Drive | Robustness) -> dict[str, Any]:
         shown = result
     elif isinstance(config, Drive):
         result = drive(config)
+        shown = result
+    elif isinstance(config, Export):
+        result = export(config)
         shown = result
     elif isinstance(config, Robustness):
         result = robustness(config)
@@ -186,6 +201,7 @@ Command = (
     | Annotated[Train, tyro.conf.subcommand("train")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Drive, tyro.conf.subcommand("drive")]
+    | Annotated[Export, tyro.conf.subcommand("export")]
     | Annotated[Robustness, tyro.conf.subcommand("robustness")]
 )
 

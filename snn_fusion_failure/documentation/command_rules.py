@@ -101,6 +101,8 @@ RULES = (
     Rule("train_detector.py train", "--size tiny --steps 1 --overwrite"),
     Rule("train_detector.py eval", "--size tiny --pictures 1"),
     Rule("train_detector.py drive", "--size tiny --frames 2"),
+    Rule("train_detector.py robustness", "--size tiny --kinds camera_blackout --levels 5"),
+    Rule("train_detector.py export", "--size tiny --points 2000", needs="flatbuffers"),
     Rule("evaluate_kitti.py"),
     Rule(
         "study_detector.py",

@@ -92,9 +92,7 @@ def prepare(config: Prepare) -> dict[str, Any]:
     sizes = "; ".join(f"{a:.2f} x {b:.2f} x {c:.2f}" for a, b, c in cache.sizes)
     print(f"anchor sizes (length x width x height) [m]: {sizes}")
     fields = {f"frames_{split}": len(names) for split, names in cache.splits.items()}
-    skipped = len(cache.counts["skipped"])
-    numbers = {k: v for k, v in cache.counts.items() if k != "skipped"}
-    return fields | {"skipped": skipped} | numbers
+    return fields | {"skipped": 0} | cache.counts | {"skipped": len(cache.counts["skipped"])}
 
 
 def train(config: Train) -> dict[str, Any]:
@@ -168,21 +166,11 @@ def train(config: Train) -> dict[str, Any]:
 
 def main(config: Prepare | Train | Eval | Drive | Export | Robustness) -> dict[str, Any]:
     """Run one of the six commands."""
-    if isinstance(config, Prepare):
-        result = prepare(config)
-        shown = result
-    elif isinstance(config, Train):
-        result = train(config)
-        shown = result
-    elif isinstance(config, Drive):
-        result = drive(config)
-        shown = result
-    elif isinstance(config, Export):
-        result = export(config)
-        shown = result
-    elif isinstance(config, Robustness):
-        result = robustness(config)
-        shown = result
+    run: dict[type, Any] = {
+        Prepare: prepare, Train: train, Drive: drive, Export: export, Robustness: robustness
+    }  # fmt: skip
+    if not isinstance(config, Eval):
+        shown = result = run[type(config)](config)
     else:
         result = evaluate(config)
         names = (

@@ -15,6 +15,7 @@ DetectorModel = Literal["avod", "avod_argate", "dense", "dense_argate", "dense_o
 DETECTORS: tuple[str, ...] = get_args(DetectorModel)
 
 Precision = Literal["float32", "bfloat16"]
+Overlap = Literal["upright", "rotated"]
 Target = Literal["Car", "Pedestrian", "Cyclist"]
 TARGETS: tuple[str, ...] = get_args(Target)
 # k-means of the 14,357, 2,207 and 734 labels of the usual training list: length, width, height [m].
@@ -103,6 +104,9 @@ class DetectorConfig:
         second_batch, second_iou: likewise of the second stage.
         truth_proposals: shifted copies of each label among the training proposals (0 in AVOD).
         final_nms, max_detections, score_threshold: of the result.
+        final_overlap: what `final_nms` limits in the two-stage models: `upright`, the overlap of
+            the smallest upright rectangles on the ground, as in AVOD, or `rotated`, that of the
+            boxes' own; `dense` models always take the latter.
         label_smoothing, regression_weight, angle_weight: of the losses.
         gate_loss, targets: terms of Equation 3.2, see `fusion.losses`.
         auxiliary_second: the auxiliary paths of the views go on through the second stage.
@@ -150,6 +154,7 @@ class DetectorConfig:
     second_iou: tuple[float, float] = (0.55, 0.65)
     truth_proposals: int = 0
     final_nms: float = 0.01
+    final_overlap: Overlap = "upright"
     max_detections: int = 100
     score_threshold: float = 0.1
     label_smoothing: float = 0.001
@@ -173,6 +178,10 @@ class DetectorConfig:
             raise ValueError(f"norm={self.norm!r}: expected 'batch' or 'group'")
         if self.precision not in get_args(Precision):
             raise ValueError(f"precision={self.precision!r}: expected 'float32' or 'bfloat16'")
+        if self.final_overlap not in get_args(Overlap):
+            raise ValueError(
+                f"final_overlap={self.final_overlap!r}: expected 'upright' or 'rotated'"
+            )
         if self.normalizer not in get_args(Normalizer):
             raise ValueError(
                 f"normalizer={self.normalizer!r}: expected one of {', '.join(get_args(Normalizer))}"

@@ -222,6 +222,26 @@ def test_parameters_match_and_weights_start_even() -> None:
     np.testing.assert_allclose(fuse(crops, jnp.array([[2.0, 0.0]])), 2.0)
 
 
+def test_rotated_suppression_keeps_cars_that_stand_side_by_side_at_an_angle() -> None:
+    # Two cars parked at 45 degrees, 2.4 m apart across their length: free of each other, while the
+    # upright rectangles around them share a fifth of theirs.
+    across = 2.4 / np.sqrt(2)
+    boxes = np.array([[0, 1.6, 10, 4.2, 1.7, 1.5, np.pi / 4]] * 2, np.float32)
+    boxes[1, [0, 2]] += [across, across]
+    scores = jnp.array([[0.0, 2.0], [0.0, 1.0]])
+    half, kept = jnp.full(2, 0.5), {}
+    for overlap in ("upright", "rotated"):
+        config = dataclasses.replace(TINY, final_overlap=overlap)
+        kept[overlap] = int(
+            final_boxes(
+                config, jnp.asarray(boxes), scores, jnp.ones(2, bool), half, half
+            ).mask.sum()
+        )
+    assert kept == {"upright": 1, "rotated": 2}
+    with pytest.raises((ValueError, TypeError), match="final_overlap"):
+        dataclasses.replace(TINY, final_overlap="round")  # type: ignore[arg-type]
+
+
 def test_mini_batches_are_half_positive_at_most() -> None:
     boxes = jnp.array(
         [[0.0, 0, 2, 2], [0.4, 0, 2.4, 2], [1, 0, 3, 2], [9, 9, 11, 11], [0, 0, 2, 2]]

@@ -20,6 +20,7 @@ from fusion.detection.geometry.encodings import (
     box4c_to_box3d,
     box_corners,
     decode_offsets,
+    ground_box,
     project_boxes,
     resolve_heading,
 )
@@ -118,13 +119,15 @@ def final_boxes(
     """
     probability = jax.nn.softmax(scores, axis=-1)[:, 1]
     sound = (boxes[:, 3:6] > 0.0).all(axis=1) & jnp.isfinite(boxes).all(axis=1)
+    rotated = config.final_overlap == "rotated"
     index, found = nms(
-        anchor_ground(box3d_to_anchor(boxes)),
+        ground_box(boxes) if rotated else anchor_ground(box3d_to_anchor(boxes)),
         probability,
         mask & sound & (probability >= config.score_threshold),
         iou_threshold=config.final_nms,
         max_output=config.max_detections,
         max_candidates=boxes.shape[0],
+        overlap=config.final_overlap,
     )
     return Detections(
         boxes[index],

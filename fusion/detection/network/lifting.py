@@ -65,8 +65,8 @@ def lift(
         left = jnp.clip(jnp.floor(u), 0, max(width - 2, 0)).astype(jnp.int32)
         top = jnp.clip(jnp.floor(v), 0, max(height - 2, 0)).astype(jnp.int32)
         fu, fv = u - left.astype(u.dtype), v - top.astype(v.dtype)
-        shares = [(1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu]
-        shares = jnp.where(inside[..., None], jnp.stack(shares, axis=-1), 0.0)
+        corner = [(1 - fv) * (1 - fu), (1 - fv) * fu, fv * (1 - fu), fv * fu]
+        shares = jnp.where(inside[..., None], jnp.stack(corner, axis=-1), 0.0)
         # Kept apart, or the gradient would compute them anew for every channel of every corner.
         at, shares = jax.lax.optimization_barrier((top * width + left, shares))
         found.append(jnp.einsum("rsk,rskc->rsc", shares, table[at]))

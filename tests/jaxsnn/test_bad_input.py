@@ -244,7 +244,7 @@ CALLS = {
     ),
     "a step with a row of spikes": (
         "network.step(config, constants, net(), jnp.ones((1, 210)), jnp.ones(2))",
-        "pre=<shape (1, 210)>: expected (210,)",
+        "pre=<shape (1, 210)>: expected (210,), a column for each input",
     ),
     "a step with one reward": (
         "network.step(config, constants, net(), jnp.ones(210), 1.0)",

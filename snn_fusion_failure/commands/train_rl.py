@@ -83,6 +83,13 @@ def _is_detour(scenario: str) -> bool:
     return scenario.startswith("D")
 
 
+def _changes(config: Config) -> list[str]:
+    """Constants that the command line changes, `part.name=value`."""
+    given = {name: getattr(config, name) for name in ("learning_rate", "discount", "epsilon")}
+    named = [f"params.{name}={value}" for name, value in given.items() if value is not None]
+    return [*named, *config.changes]
+
+
 def build(config: Config, scenario: str) -> dict[str, Any]:
     """The learner's constants (and PPO's sizes) on a map, with the command line's changes."""
     from jaxsnn import learners, ppo, qlearning
@@ -95,9 +102,7 @@ def build(config: Config, scenario: str) -> dict[str, Any]:
         if config.preset == "quick":
             sizes = dataclasses.replace(sizes, n_updates=sizes.n_updates // 5)
         parts = {"params": params, "config": sizes}
-    given = {name: getattr(config, name) for name in ("learning_rate", "discount", "epsilon")}
-    changes = [f"params.{name}={value}" for name, value in given.items() if value is not None]
-    parts = apply_changes(parts, [*changes, *config.changes])
+    parts = apply_changes(parts, _changes(config))
     check: Any = ppo.check_ppo if config.model == "ppo" else qlearning.check_q
     check(parts["params"])
     return parts
@@ -133,6 +138,11 @@ def main(config: Config) -> dict[str, Any]:
         raise ValueError(
             f"preset={config.preset!r}: expected 'paper' with --record, a quick run is no result "
             "of record; leave one of them out"
+        )
+    if config.record and (_changes(config) or config.test_epsilon):
+        raise ValueError(
+            f"record=True, set={_changes(config)}, test_epsilon={config.test_epsilon}: expected "
+            "the constants of the study, a row of record is known by its name alone; leave one out"
         )
     if config.record:
         check_recordable()

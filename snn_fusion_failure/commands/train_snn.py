@@ -59,6 +59,12 @@ def main(config: Config) -> dict[str, Any]:
                 "record=True: expected a scenario of the source, new networks and 20 learning "
                 "trials; leave out --map, --from and --learn-trials"
             )
+        if config.changes or config.preset != "paper":
+            raise ValueError(
+                f"record=True, preset={config.preset!r}, set={list(config.changes)}: expected the "
+                "constants of the network and the whole run, a row of record is known by its name "
+                "alone; leave out --set and --preset quick"
+            )
         check_recordable()
     map = named_map(config.map) if config.map else scenarios.scenario(config.scenario)
     quick = config.preset == "quick"

@@ -167,3 +167,10 @@ def test_the_table_of_trials_has_all_maps_and_the_share_that_gets_there(tmp_path
         ("D1", "PPO", "trials_to_90", "python new.py", "def"),
         ("D1", "PPO", "share_reaching_90", "python new.py", "def"),
     ]
+
+
+@pytest.mark.parametrize("changed", [{"epsilon": 0.0}, {"changes": ("params.discount=0.5",)}])
+def test_changed_constants_are_no_row_of_record(changed: dict[str, Any], tmp_path: Path) -> None:
+    config = train_rl.Config(seeds=2, record=True, out=tmp_path / "run", **changed)
+    with pytest.raises(ValueError, match=r"record=True, set=\['params\..*expected the constants"):
+        train_rl.main(config)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -24,3 +25,12 @@ def test_each_reading_is_recorded_under_its_own_name(
     assert {row["model"]: row["mean"] for row in rows} == {
         "S4": 90.0, "S4 literal": 30.0, "S4 way": 99.0,
     }  # fmt: skip
+
+
+@pytest.mark.parametrize(
+    "changed", [{"preset": "quick"}, {"preset": "paper", "changes": ("params.gamma=1e-4",)}]
+)
+def test_another_network_or_a_short_run_is_no_row_of_record(changed: dict[str, Any]) -> None:
+    config = train_snn.Config(record=True, **changed)
+    with pytest.raises(ValueError, match=r"record=True, preset=.*known by its name alone"):
+        train_snn.main(config)

@@ -18,7 +18,6 @@ On the detours D1 to D3 PPO has the sizes and rates of `scripts/studies/study_de
 from __future__ import annotations
 
 import dataclasses
-import json
 from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated, Any, Literal
@@ -26,20 +25,19 @@ from typing import Annotated, Any, Literal
 from tyro.conf import arg
 
 from snn_fusion_failure.records.detour_rows import row_name, train_map
-from snn_fusion_failure.records.rows import record_table, summarize
+from snn_fusion_failure.records.robot_rows import record_learner
+from snn_fusion_failure.records.rows import summarize
 from snn_fusion_failure.runs import (
     append_metrics,
     apply_changes,
     enable_compilation_cache,
     open_run,
     progress,
-    repository,
     write_json,
 )
 from snn_fusion_failure.runs.command import run_command
 from snn_fusion_failure.runs.origin import check_recordable
 
-TABLES = {"1": "2.3", "2": "2.4", "3": "2.5"}
 # Number of a map -> its own root of keys; those of Scenarios 1-3 are the numbers of record.
 MAPS = {"1": 1, "2": 2, "3": 3, "D1": 11, "D2": 12, "D3": 13}
 NAMES = {"qlearning": "Q-learning", "ppo": "PPO"}
@@ -167,34 +165,10 @@ def main(config: Config) -> dict[str, Any]:
             results[scenario] = summary
             append_metrics(out, {"scenario": scenario, "model": model, **summary})
             if config.record:
-                _record(config, model, scenario, summary)
+                record_learner(model, scenario, row_name(scenario), summary, config.preset)
             bar.update(task, advance=1, status=f"testing {summary['sr_testing']['mean']:.1f} %")
     write_json(out / "result.json", results)
     return results
-
-
-def _record(config: Config, model: str, scenario: str, summary: dict[str, Any]) -> None:
-    """Rows of one map into results/; a map of a table of the source has its rows there, too."""
-    units = {"sr": "%", "share": "%", "n_mv": "steering movements", "path": "1"}
-    row, table = row_name(scenario), TABLES.get(scenario)
-    source_file = repository.RESULTS / "source_tables.json"
-    source = json.loads(source_file.read_text())[table]["rows"].get(model, {}) if table else {}
-    cells = []
-    for metric, numbers in summary.items():
-        unit = next((u for start, u in units.items() if metric.startswith(start)), "trials")
-        cell = {"row": row, "model": model, "metric": metric, "unit": unit, **numbers}
-        cells.append(cell | ({"source": source[metric]} if metric in source else {}))
-    record_table(
-        repository.RESULTS / "study_rl.json", "study_rl",
-        "Q-learning and PPO on Scenarios 1-3 and the detours D1-D3", cells,
-        preset=config.preset, whole_cells=True,
-    )  # fmt: skip
-    if table and model == "Q-learning":
-        record_table(
-            repository.RESULTS / f"table_{table.replace('.', '_')}.json", table, row,
-            [c for c in cells if c["metric"] in ("sr_learning", "sr_testing", "n_mv")],
-            preset=config.preset,
-        )  # fmt: skip
 
 
 def _fields(found: dict[str, Any]) -> dict[str, Any]:

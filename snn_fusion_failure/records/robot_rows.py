@@ -2,10 +2,12 @@
 
 from __future__ import annotations
 
+import json
 from pathlib import Path
 from typing import Any, NamedTuple
 
-from snn_fusion_failure.records.rows import recorded
+from snn_fusion_failure.records.rows import record_table, recorded
+from snn_fusion_failure.runs import repository
 
 Row = dict[str, Any]
 
@@ -61,3 +63,34 @@ def beside(results: Path, table: str, case: str) -> tuple[list[Row], str]:
             listed.append(f"{names} from `results/{file}.json`")
             found += rows
     return found, f"On the same map: {'; '.join(listed)}." if listed else ""
+
+
+_UNITS = {"sr": "%", "share": "%", "n_mv": "steering movements", "path": "1"}
+"""Unit of the metrics that begin so; all others are counted in trials."""
+
+
+def record_learner(model: str, scenario: str, row: str, summary: Row, preset: str) -> None:
+    """Rows of one map of a learner into results/; in the source's table, too, where it has one.
+
+    Args:
+        model: as the source calls it.
+        scenario: `1` to `3`, or a detour.
+        row: name of the map in the files of record.
+        summary: metric -> mean, interval and number.
+        preset: size of the run.
+    """
+    table = {case.removeprefix("Scenario "): number for number, case in CASES.items()}.get(scenario)
+    source_file = repository.RESULTS / "source_tables.json"
+    source = json.loads(source_file.read_text())[table]["rows"].get(model, {}) if table else {}
+    cells = []
+    for metric, numbers in summary.items():
+        unit = next((u for start, u in _UNITS.items() if metric.startswith(start)), "trials")
+        cell = {"row": row, "model": model, "metric": metric, "unit": unit, **numbers}
+        cells.append(cell | ({"source": source[metric]} if metric in source else {}))
+    title = "Q-learning and PPO on Scenarios 1-3 and the detours D1-D3"
+    path = repository.RESULTS / "study_rl.json"
+    record_table(path, "study_rl", title, cells, preset=preset, whole_cells=True)
+    if table and model == "Q-learning":
+        path = repository.RESULTS / f"table_{table.replace('.', '_')}.json"
+        theirs = [c for c in cells if c["metric"] in ("sr_learning", "sr_testing", "n_mv")]
+        record_table(path, table, row, theirs, preset=preset)

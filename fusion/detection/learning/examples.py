@@ -133,8 +133,8 @@ def make_example(
         config: gives the sizes.
         frame: as read; without a plane file the ground plane is fitted.
         ground: where the plane is looked for; the benchmark's car when left out.
-        plane: the ground of a corrupted copy of a frame, known from the frame itself. The scan is
-            then taken as it is: no plane is fitted or looked at, and no point need be there.
+        plane: `[4]` ground of a corrupted copy of a frame, known from the frame itself. The scan
+            is then taken as it is: no plane is fitted or looked at, and no point need be there.
 
     Returns:
         The example and counts: `plane_fitted`, `points_dropped` (in the image, over `max_points`),

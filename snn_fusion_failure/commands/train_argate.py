@@ -45,12 +45,15 @@ _NOT_SETTINGS = ("out", "resume", "overwrite", "data_dir", "download")
 
 
 def forget_from(out: Path, case: str, epoch: int) -> None:
-    """Drop lines of `metrics.jsonl` from this epoch on: they are about to be written again."""
+    """Drop lines of `metrics.jsonl` from this epoch on: they are about to be written again.
+
+    A last line that a kill has torn goes as well; append to it, and two lines are lost.
+    """
     path = out / "metrics.jsonl"
     if not path.exists():
         return
     lines = path.read_text(encoding="utf-8").splitlines(keepends=True)
-    rows = zip(lines, map(json.loads, lines), strict=True)
+    rows = [(line, json.loads(line)) for line in lines if line.endswith("\n")]
     kept = [line for line, row in rows if row["case"] != case or row["epoch"] < epoch]
     if len(kept) < len(lines):
         write_text(path, "".join(kept))

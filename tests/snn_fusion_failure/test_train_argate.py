@@ -181,6 +181,16 @@ def test_a_resumed_run_has_each_epoch_once(tmp_path: Path) -> None:
     assert [json.loads(line)["epoch"] for line in lines] == [1, 3]
 
 
+def test_a_run_whose_last_line_was_torn_goes_on(tmp_path: Path) -> None:
+    append_metrics(tmp_path, {"case": "random", "epoch": 1})
+    with (tmp_path / "metrics.jsonl").open("a", encoding="utf-8") as file:
+        file.write('{"case": "random", "epo')
+    train_argate.forget_from(tmp_path, "random", 2)
+    append_metrics(tmp_path, {"case": "random", "epoch": 2})
+    lines = (tmp_path / "metrics.jsonl").read_text().splitlines()
+    assert [json.loads(line)["epoch"] for line in lines] == [1, 2]
+
+
 TINY = {
     "3.1": (
         "Made up",

@@ -29,6 +29,13 @@ FAR = 0.5
 """A reading farther outside the training range than this share of it is flagged."""
 
 
+def far_outside(x: Float[np.ndarray, "n c t"], scale: Scale) -> Bool[np.ndarray, "n c"]:
+    """Which channels of which windows hold a reading far outside the training range (`FAR`)."""
+    margin = FAR * (scale.high - scale.low)
+    low, high = (scale.low - margin)[:, None], (scale.high + margin)[:, None]
+    return ((x < low) | (x > high)).any(axis=-1)
+
+
 class Prediction(NamedTuple):
     """What a fitted network says about a batch of windows; arrays on the host.
 
@@ -132,9 +139,7 @@ class FittedARGate:
             self.config, self.params, self.monitor, jnp.float32(self.temperature), scaled
         )
         probabilities, weights, calls = map(np.asarray, arrays)
-        margin = FAR * (self.scale.high - self.scale.low)
-        low, high = (self.scale.low - margin)[:, None], (self.scale.high + margin)[:, None]
-        far = ((raw < low) | (raw > high)).any(axis=-1) & ~absent
+        far = far_outside(raw, self.scale) & ~absent
         failed = absent | (calls > np.asarray(self.monitor.threshold))
         return Prediction(probabilities, weights, calls, failed, far)
 

@@ -17,7 +17,7 @@ from fusion._array_files import build, flatten, read_arrays, unflatten, write_ar
 from fusion._checks import check_mask
 from fusion.data.csv_folder import SensorFolder, TargetKind
 from fusion.data.dataset import Scale, apply_scale
-from fusion.fitted import FAR
+from fusion.fitted import far_outside
 from fusion.sensor_network import FolderConfig, fusion_of
 
 FORMAT = "sensors 1"
@@ -97,9 +97,7 @@ class FittedSensors:
             there &= given.astype(bool)
         scaled, far = [], np.zeros_like(there)
         for s, (x, scale) in enumerate(zip(raw, self.scales, strict=True)):
-            margin = FAR * (scale.high - scale.low)
-            low, high = (scale.low - margin)[:, None], (scale.high + margin)[:, None]
-            far[:, s] = there[:, s] & ((x < low) | (x > high)).any(axis=(1, 2))
+            far[:, s] = there[:, s] & far_outside(x, scale).any(axis=1)
             present = there[:, s, None, None]
             scaled.append(np.where(present, apply_scale(x, scale), 0.0).astype(np.float32))
         sizes = len(self.sensors), len(self.names)

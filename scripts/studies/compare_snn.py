@@ -19,7 +19,7 @@ import json
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import record_comparisons, record_table
+from snn_fusion_failure.records.rows import record_comparisons, record_table, rows_with_origin
 from snn_fusion_failure.runs import repository, run_command
 
 PAIRS = (("S2", "S1"), ("S4", "S3"), ("S3", "S1"), ("S4", "S2"))
@@ -56,14 +56,9 @@ def sample_efficiency(results: Path) -> list[dict[str, Any]]:
     """Rows on the way to 90 % of all learners by map, from the studies that are there."""
     rows = []
     for name in ("study_snn_trials", "study_rl"):
-        path = results / f"{name}.json"
-        if not path.exists():
-            continue
-        held = json.loads(path.read_text(encoding="utf-8"))
-        for row in held["rows"]:
+        for row in rows_with_origin(results / f"{name}.json"):
             if row["metric"] in ("trials_to_90", "share_reaching_90"):
-                made = {name: row.get(name) or held[name] for name in ("command", "git")}
-                rows.append(row | made | {"row": row["row"].removeprefix("trained on ")})
+                rows.append(row | {"row": row["row"].removeprefix("trained on ")})
     return rows
 
 

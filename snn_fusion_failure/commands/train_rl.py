@@ -165,7 +165,7 @@ def main(config: Config) -> dict[str, Any]:
             results[scenario] = summary
             append_metrics(out, {"scenario": scenario, "model": model, **summary})
             if config.record:
-                record_learner(model, scenario, row_name(scenario), summary, config.preset)
+                record_learner(model, row_name(scenario), summary, config.preset)
             bar.update(task, advance=1, status=f"testing {summary['sr_testing']['mean']:.1f} %")
     write_json(out / "result.json", results)
     return results

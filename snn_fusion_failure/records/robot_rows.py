@@ -69,17 +69,16 @@ _UNITS = {"sr": "%", "share": "%", "n_mv": "steering movements", "path": "1"}
 """Unit of the metrics that begin so; all others are counted in trials."""
 
 
-def record_learner(model: str, scenario: str, row: str, summary: Row, preset: str) -> None:
+def record_learner(model: str, row: str, summary: Row, preset: str) -> None:
     """Rows of one map of a learner into results/; in the source's table, too, where it has one.
 
     Args:
         model: as the source calls it.
-        scenario: `1` to `3`, or a detour.
         row: name of the map in the files of record.
         summary: metric -> mean, interval and number.
         preset: size of the run.
     """
-    table = {case.removeprefix("Scenario "): number for number, case in CASES.items()}.get(scenario)
+    table = {case: number for number, case in CASES.items()}.get(row)
     source_file = repository.RESULTS / "source_tables.json"
     source = json.loads(source_file.read_text())[table]["rows"].get(model, {}) if table else {}
     cells = []

@@ -142,7 +142,7 @@ def record_table(
     new = {key(row)[:parts] for row in rows}
     kept = [
         row if row.get("ci95") else {**row, **_ends(row)}
-        for row in _with_origin(path)
+        for row in rows_with_origin(path)
         if key(row)[:parts] not in new
     ]
     held = {"table": table, "title": title, "preset": preset, **made, "rows": kept + rows}
@@ -150,7 +150,7 @@ def record_table(
     write_json(path, held | ({"comparisons": comparisons} if comparisons else {}))
 
 
-def _with_origin(path: Path) -> list[dict[str, Any]]:
+def rows_with_origin(path: Path) -> list[dict[str, Any]]:
     """Rows of a table of record; those of old files, without a command, get their file's."""
     if not path.exists():
         return []

@@ -111,8 +111,11 @@ def check_array(name: str, value: Any) -> None:
         raise TypeError(f"{name}.dtype={value.dtype}: expected numbers; convert the readings first")
 
 
-def check_mask(name: str, value: Any, shape: tuple[int, ...], *, numbers: bool = False) -> None:
-    """`value` is an array of this shape, of truth values unless it may hold `numbers`."""
+def check_mask(name: str, value: Any, shape: tuple[Any, ...], *, numbers: bool = False) -> None:
+    """`value` is an array of this shape, of truth values unless it may hold `numbers`.
+
+    A size of `shape` may be a symbol: that of the batch is one while a program is exported.
+    """
     check_array(name, value)
     if tuple(value.shape) != tuple(shape):
         raise ValueError(

@@ -19,6 +19,7 @@ from typing import Any
 
 from snn_fusion_failure.records import fusion_tables, markdown, pages
 from snn_fusion_failure.records.pages import load
+from snn_fusion_failure.records.restored import channel_case, unseen_case
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import print_result, repository, run_command, to_jsonable, write_text
 
@@ -60,7 +61,7 @@ def collect_channel_weights(config: Config) -> list[dict[str, Any]]:
     """Figure 3.7 in numbers: mean fusion weight of a channel when failed and when clean."""
     values: dict[tuple[str, str, str, str], list[float]] = {}
     for table, row, model, record in _single_runs(config.runs, "channel"):
-        case = f"Table {table}, {row}: {record['channel']['name']}"
+        case = channel_case(table, row, record["channel"]["name"])
         for metric in ("when_failed", "when_clean"):
             weights = record["channel"][metric]
             if weights:
@@ -77,11 +78,11 @@ def collect_unseen_kinds(config: Config) -> list[dict[str, Any]]:
     for table, row, model, record in _single_runs(config.runs, "robustness"):
         kinds = {kind: value / 100.0 for kind, value in record["robustness"].items()}
         for kind, value in kinds.items():
-            case = f"Table {table}, trained on {row}, tested on {kind}"
+            case = unseen_case(table, row, kind)
             values.setdefault((case, model, "accuracy", "%"), []).append(100.0 * value)
         # Over the clean third of the same test; a third of the rows under a kind is clean too.
         retained = mean_retained_accuracy(kinds, record["accuracy_clean"] / 100.0)
-        case = f"Table {table}, trained on {row}"
+        case = unseen_case(table, row)
         values.setdefault((case, model, "mean_retained_accuracy", "1"), []).append(retained)
     return _summaries(values)
 
@@ -96,6 +97,9 @@ def draw_channel_weights(config: Config, path: Path) -> str | None:
     models: dict[str, tuple[Any, Any]] = {}
     channel = None
     for _, _, model, record in _single_runs(config.runs, "channel"):
+        # A run that comes from a table of record holds the means only.
+        if record["channel"].get("means_only"):
+            continue
         if model in models or model not in fusion_tables.FIVE[1:]:
             continue
         channel = record["channel"]["name"]

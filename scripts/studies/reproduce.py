@@ -10,8 +10,9 @@ regulator) and writes `report/index.html`: all tables and figures beside the sou
 with the results of record. The second makes tables of record in results/, `--preset paper` without
 `--table` all of them; the third draws the page from what is there, in seconds.
 
-Every run is kept as it comes: the same command again goes on after an interruption. `--shard 0/2`
-and `--shard 1/2` in two shells (or on two machines that share the folder) halve the time of the
+Every run is kept as it comes: the same command again goes on after an interruption. With
+`--restore` a new machine trains only the seeds of Tables 3.1 to 3.6 that results/ lacks. `--shard
+0/2` and `--shard 1/2` in two shells (or on two machines that share the folder) halve the time of the
 3.x tables. What each costs is in docs/reproduction.md.
 """
 
@@ -50,6 +51,9 @@ class Config:
     """Where the tables go; results/ for paper, OUT/results for quick."""
     collect_only: bool = False
     """Train nothing; rebuild the tables from the runs that are there."""
+    restore: bool = False
+    """Train no seed of Tables 3.1 to 3.6 again that the tables in RESULTS hold: on a new machine,
+    only what is missing."""
     report_only: bool = False
     """Run and collect nothing; draw the page from the tables that are there."""
     report: Path | None = None
@@ -96,6 +100,7 @@ def _fill(config: Config, out: Path | None, results: Path) -> tuple[dict[str, An
         data_dir=config.data_dir,
         out=out,
         collect_only=config.collect_only,
+        restore=config.restore,
     )
     by_runner: dict[Callable[..., Any], list[str]] = {}
     for table in _tables(config):

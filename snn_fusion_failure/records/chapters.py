@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.records import fusion_tables
+from snn_fusion_failure.records.restored import restore
 from snn_fusion_failure.records.rows import record_comparisons, record_table, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, progress, repository, write_json
 
@@ -48,6 +49,7 @@ class Plan:
         out: folder of the single runs; each chapter's own when None.
         results: folder of the tables.
         collect_only: run nothing.
+        restore: take the seeds that tables of record hold as done.
     """
 
     preset: str
@@ -59,6 +61,7 @@ class Plan:
     data_dir: Path | None = None
     out: Path | None = None
     collect_only: bool = False
+    restore: bool = False
 
     def wants(self, model: str) -> bool:
         """Is this model asked for?"""
@@ -142,6 +145,8 @@ def sensor_fusion(plan: Plan, tables: Sequence[str]) -> Done:
 
     out = plan.out or Path("runs") / f"reproduce_{plan.preset}"
     seeds = plan.seeds or (1 if plan.piece else 5)
+    if plan.restore:
+        restore(tables, plan.results, out, seeds)
     todo = [
         run
         for table in tables

@@ -13,6 +13,7 @@ from typing import TYPE_CHECKING, Any
 
 from snn_fusion_failure.records.ceilings import CEILINGS, score
 from snn_fusion_failure.records.rows import summarize
+from snn_fusion_failure.runs.origin import commit
 
 if TYPE_CHECKING:
     from fusion.failure_kinds import FailureKind
@@ -165,7 +166,7 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
 
     if run.model in CEILINGS:
         (case,) = build_cases(Config(**run.row.settings), dataset).values()
-        return score(run.model, dataset, case.noise, run.seed)
+        return score(run.model, dataset, case.noise, run.seed) | {"git": commit()}
     config = Config(model=run.model, preset=preset, seed=run.seed, **run.row.settings)
     settings = build_settings(config, dataset)
     (case,) = build_cases(config, dataset).values()
@@ -174,6 +175,7 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
         "parameters": count_parameters(settings.model),
         "epochs": settings.train.epochs,
         "train_loss": fitted.history[-1]["total"],
+        "git": commit(),
     }
     if dataset.name == "har":
         right = 100.0 * (output.labels == output.logits.argmax(-1))
@@ -260,7 +262,9 @@ def collect(
                 continue
             unit = "%" if metric.startswith("accuracy") else "1"
             cell: dict[str, Any] = {"row": row, "model": model, "metric": metric, "unit": unit}
-            cell |= summarize(values)
+            cell |= {"seeds": order} | summarize(values)
+            if commits := sorted({by_seed[s]["git"] for s in order if "git" in by_seed[s]}):
+                cell["git"] = ", ".join(commits)
             column = "baseline" if model == "equal_weights" else model
             if metric == "accuracy" and column in printed["columns"]:
                 cell["source"] = printed["rows"][row][printed["columns"].index(column)]
@@ -275,9 +279,12 @@ def collect(
                 [a[s]["accuracy"] for s in common], [b[s]["accuracy"] for s in common]
             )
             found = {"row": row, "comparison": f"{better} - {worse}", **test._asdict()}
-            if all("subjects" in t[s] for t in (a, b) for s in common):
-                apart = [np.subtract(a[s]["subjects"], b[s]["subjects"]).tolist() for s in common]
+            # Runs that come from a table of record have no scores of single subjects.
+            known = [s for s in common if "subjects" in a[s] and "subjects" in b[s]]
+            if len(known) > 1:
+                apart = [np.subtract(a[s]["subjects"], b[s]["subjects"]).tolist() for s in known]
                 found["over_subjects_and_seeds"] = list(two_way_interval(apart))
+                found["seeds_of_subjects"] = known
             studies.append(found)
         oracle = held.get((row, "oracle"), {})
         base = held.get((row, "equal_weights")) or held.get((row, "baseline"), {})

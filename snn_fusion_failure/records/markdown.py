@@ -214,18 +214,24 @@ def comparisons(study: Table, table: Table | None) -> str:
             continue
         a, _, b = row["comparison"].partition(" - ")
         ours = f"{row['difference']:+.2f} [{row['low']:+.2f}, {row['high']:+.2f}]"
-        p = number(row["p_value"], "1")
-        if row["p_value"] is not None and row["p_value"] < 0.0005:
-            p = "< 0.0005"
+        p = _p_value(row["p_value"])
+        if "p_holm" in row:
+            p += f", {_p_value(row['p_holm'])}"
+        wide = row.get("over_subjects_and_seeds")
+        subjects = f"[{wide[0]:+.2f}, {wide[1]:+.2f}]" if wide else ""
         source, verdict = "", ""
         if (row["row"], a) in printed and (row["row"], b) in printed:
             difference = printed[row["row"], a] - printed[row["row"], b]
             source = f"{difference:+.2f}"
             verdict = _claim(difference, row["low"], row["high"])
-        lines.append([row["row"], row["comparison"], ours, p, str(row["n"]), source, verdict])
+        n = str(row["n"])
+        lines.append([row["row"], row["comparison"], ours, subjects, p, n, source, verdict])
     parts = []
     if lines:
-        header = ["case", "difference", "points [95 %]", "p", "n", "source", "the source's order"]
+        header = ["case", "difference", "points [95 %]", "over test subjects too"]
+        header += ["p, Holm's", "n", "source", "the source's order"]
+        if not any(line[3] for line in lines):
+            header, *lines = ([*line[:3], *line[4:]] for line in (header, *lines))
         parts.append(
             "**Paired differences** (same seed, corruption and split)\n\n" + grid(header, lines)
         )
@@ -235,6 +241,10 @@ def comparisons(study: Table, table: Table | None) -> str:
             "the failed channels\n\n" + pivot(gaps, "row", "model")
         )
     return "\n\n".join(parts)
+
+
+def _p_value(value: float | None) -> str:
+    return "< 0.0005" if value is not None and value < 0.0005 else number(value, "1")
 
 
 def _claim(source: float, low: float, high: float) -> str:

@@ -6,6 +6,7 @@ import dataclasses
 import html.parser
 import json
 import math
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +19,7 @@ from snn_fusion_failure.runs import repository, write_json
 from tests._scripts import load_script
 
 reproduce = load_script("studies/reproduce")
+render_results = load_script("studies/render_results")
 
 VOID = {"meta", "img", "br", "hr", "link", "input"}
 # One transparent pixel.
@@ -307,6 +309,33 @@ def test_collecting_from_single_runs(tmp_path: Path) -> None:
     page = Page((tmp_path / "page" / "index.html").read_text(encoding="utf-8"))
     (line, *_) = _line(page, "table-3.1", "clean: accuracy [%]", "Baseline (quick)")
     assert line[1:4] == ["94.06", "99.00", "✓ better"] and line[-1] == "quick run"
+
+
+def test_seeds_of_record_are_not_run_again(tmp_path: Path) -> None:
+    """A new machine has the tables and not the runs: what they hold comes back, with its commit."""
+    out, results = tmp_path / "out", tmp_path / "results"
+    first, *_ = (r for r in chapters.fusion_tables.runs("3.1", 1) if r.row.robustness)
+    kinds = dict.fromkeys(chapters.fusion_tables.UNSEEN_KINDS, 80.0)
+    for seed in (0, 1):
+        run = dataclasses.replace(first, seed=seed)
+        scores = dict.fromkeys(chapters.fusion_tables.METRICS, 90.0 + seed)
+        write_json(run.path(out), scores | {"git": "abc", "robustness": kinds})
+    config = reproduce.Config(
+        table=("3.1",), seeds=3, out=out, results=results, report=tmp_path / "page",
+        collect_only=True, restore=True,
+    )  # fmt: skip
+    before = reproduce.main(config)["3.1"]
+    unseen = render_results.collect_unseen_kinds(render_results.Config(runs=out))
+    write_json(results / "study_unseen_kinds.json", {"rows": unseen})
+    shutil.rmtree(out)
+    newer = dict.fromkeys(chapters.fusion_tables.METRICS, 92.0) | {"git": "def"}
+    write_json(dataclasses.replace(first, seed=2).path(out), newer)
+    after = reproduce.main(config)["3.1"]
+    assert [row["values"] for row in before] == [[90.0, 91.0]] * len(before)
+    for row in after:
+        assert (row["values"], row["seeds"], row["git"]) == ([90.0, 91.0, 92.0], [0, 1, 2], "abc, def")  # fmt: skip
+    assert len(after) == len(before) == len(chapters.fusion_tables.METRICS)
+    assert render_results.collect_unseen_kinds(render_results.Config(runs=out)) == unseen
 
 
 def test_models_of_other_chapters_start_no_search(tmp_path: Path) -> None:

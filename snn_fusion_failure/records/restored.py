@@ -1,0 +1,86 @@
+"""Single runs of Tables 3.1 to 3.6 from the tables of record, so that a clone can add seeds.
+
+A training costs up to a minute and its file stays on the machine that made it; its scores are in
+`results/`, seed by seed. Written back as files, they are not trained again. What the tables do not
+hold (accuracies of single test subjects, single fusion weights) is absent from them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+from snn_fusion_failure.records import fusion_tables
+from snn_fusion_failure.records.rows import recorded, rows_with_origin, values_by_seed
+from snn_fusion_failure.runs import write_json
+
+Scores = dict[tuple[str, str, str], dict[int, float]]
+"""(row, model, metric) -> seed -> value."""
+
+
+def unseen_case(table: str, row: str, kind: str | None = None) -> str:
+    """Row of the study of unseen kinds: a case of a table, under one kind of failure or all."""
+    return f"Table {table}, trained on {row}" + (f", tested on {kind}" if kind else "")
+
+
+def channel_case(table: str, row: str, channel: str) -> str:
+    """Row of Figure 3.7 in numbers."""
+    return f"Table {table}, {row}: {channel}"
+
+
+def _scores(path: Path) -> Scores:
+    return {(r["row"], r["model"], r["metric"]): values_by_seed(r) for r in recorded(path)}
+
+
+def _robustness(run: fusion_tables.Run, unseen: Scores) -> dict[str, Any]:
+    """Accuracy under each kind that is never trained on; nothing unless all are held."""
+    found = {}
+    for kind in fusion_tables.UNSEEN_KINDS:
+        case = unseen_case(run.table, run.row.name, kind)
+        value = unseen.get((case, run.model, "accuracy"), {}).get(run.seed)
+        if value is None:
+            return {}
+        found[kind] = value
+    return {"robustness": found}
+
+
+def _channel(run: fusion_tables.Run, weights: Scores) -> dict[str, Any]:
+    """Fusion weights of the channel of Figure 3.7; their means are all that is held."""
+    channel = run.row.channel or ""
+    found: dict[str, Any] = {}
+    for when in ("when_failed", "when_clean"):
+        case = channel_case(run.table, run.row.name, channel)
+        value = weights.get((case, run.model, f"weight_{when}"), {}).get(run.seed)
+        if value is None:
+            return {}
+        found[when] = [value]
+    return {"channel": {"name": channel, "means_only": True, **found}}
+
+
+def restore(tables: Sequence[str], results: Path, out: Path, seeds: int) -> int:
+    """Write the single runs that `results` holds and `out` lacks; returns their number.
+
+    Args:
+        tables: their numbers, of 3.1 to 3.6.
+        results: folder of the tables of record.
+        out: folder of the single runs; what is there stays as it is.
+        seeds: seeds below this number.
+    """
+    unseen = _scores(results / "study_unseen_kinds.json")
+    weights = _scores(results / "study_channel_weights.json")
+    written = 0
+    for table in tables:
+        held: dict[tuple[str, str, int], dict[str, Any]] = {}
+        for row in rows_with_origin(results / f"table_{table.replace('.', '_')}.json"):
+            for seed, value in values_by_seed(row).items():
+                record = held.setdefault((row["row"], row["model"], seed), {"git": row["git"]})
+                record[row["metric"]] = value
+        for run in fusion_tables.runs(table, seeds):
+            scores = held.get((run.row.name, run.model, run.seed), {})
+            if "accuracy" not in scores or run.path(out).exists():
+                continue
+            more = _robustness(run, unseen) | _channel(run, weights)
+            write_json(run.path(out), scores | more)
+            written += 1
+    return written

@@ -12,8 +12,8 @@ with the results of record. The second makes tables of record in results/, `--pr
 
 Every run is kept as it comes: the same command again goes on after an interruption. With
 `--restore` a new machine trains only the seeds of Tables 3.1 to 3.6 that results/ lacks. `--shard
-0/2` and `--shard 1/2` in two shells (or on two machines that share the folder) halve the time of the
-3.x tables. What each costs is in docs/reproduction.md.
+0/2` and `--shard 1/2` in two shells (or on two machines that share the folder) halve the time of
+the 3.x tables. What each costs is in docs/reproduction.md.
 """
 
 from __future__ import annotations

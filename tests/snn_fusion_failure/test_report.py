@@ -333,7 +333,8 @@ def test_seeds_of_record_are_not_run_again(tmp_path: Path) -> None:
     after = reproduce.main(config)["3.1"]
     assert [row["values"] for row in before] == [[90.0, 91.0]] * len(before)
     for row in after:
-        assert (row["values"], row["seeds"], row["git"]) == ([90.0, 91.0, 92.0], [0, 1, 2], "abc, def")  # fmt: skip
+        assert row["values"] == [90.0, 91.0, 92.0] and row["seeds"] == [0, 1, 2]
+        assert row["git"] == "abc, def"
     assert len(after) == len(before) == len(chapters.fusion_tables.METRICS)
     assert render_results.collect_unseen_kinds(render_results.Config(runs=out)) == unseen
 

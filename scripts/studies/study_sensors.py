@@ -17,8 +17,9 @@ Nothing is chosen here: a run trains the preset for all of its epochs and is sco
 test rows, or with `--validation` on training rows that `--split-seed` draws and no training sees.
 Whole seeds come first; each training is kept in `runs/study_sensors` with the commit that made it
 and its CPU time, so the same command goes on after an interruption, and `results/study_NAME.json`
-is written after each. `above_equal_weights` is a difference seed by seed; paired t tests and
-Holm's correction over all comparisons of the table stand beside its rows.
+is written after each; `--restore` takes what that table holds as done. `above_equal_weights` is a
+difference seed by seed; paired t tests and Holm's correction over all comparisons of the table
+stand beside its rows.
 """
 
 from __future__ import annotations
@@ -29,7 +30,14 @@ import time
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.records.rows import Compared, column_cells, record_table, summarize
+from snn_fusion_failure.records.restored import held_scores
+from snn_fusion_failure.records.rows import (
+    Compared,
+    column_cells,
+    commits,
+    record_table,
+    summarize,
+)
 from snn_fusion_failure.records.sensor_cases import PAIRS, STUDIES, Case
 from snn_fusion_failure.runs import (
     enable_compilation_cache,
@@ -67,6 +75,9 @@ class Config:
     """Where the table goes."""
     collect_only: bool = False
     """Train nothing; rebuild the table from the runs that are there."""
+    restore: bool = False
+    """Train no seed again that the table in RESULTS holds: on a new machine, only what is missing.
+    """
 
     def __post_init__(self) -> None:
         """Refuse unknown studies, rows and columns."""
@@ -160,7 +171,7 @@ def collect(config: Config) -> list[dict[str, Any]]:
     rows: list[dict[str, Any]] = []
     for (name, model), by_seed in held.items():
         cell: dict[str, Any] = {"row": name, "model": model}
-        cell |= {"git": ", ".join(sorted({str(r["git"]) for r in by_seed.values()}))}
+        cell |= {"git": commits(by_seed.values())}
         # A gate is not scored where no sensor fails, nor where there is none.
         rows += [cell | scores for scores in column_cells(by_seed, units)]
         equal = held.get((name, "equal_weights"), {})
@@ -170,6 +181,15 @@ def collect(config: Config) -> list[dict[str, Any]]:
             cell |= {"metric": "above_equal_weights", "unit": "%", "seeds": common}
             rows.append(cell | summarize(gains))
     return rows
+
+
+def restore(config: Config) -> None:
+    """Write the single runs that the table of record holds and `out` lacks."""
+    held = held_scores(config.results / f"{config.name}.json")
+    for run in runs(config):
+        scores = held.get((run.case.name, run.model, run.seed), {})
+        if "accuracy" in scores and not run.path(config).exists():
+            write_json(run.path(config), scores)
 
 
 def load_data(config: Config) -> Any:
@@ -203,6 +223,8 @@ def write(config: Config) -> list[dict[str, Any]]:
 
 def main(config: Config) -> dict[str, Any]:
     """Do the runs that are missing; the table is written after each."""
+    if config.restore:
+        restore(config)
     todo = [run for run in runs(config) if not run.path(config).exists()]
     todo = [] if config.collect_only else todo
     if config.results.resolve().is_relative_to(repository.RECORD):

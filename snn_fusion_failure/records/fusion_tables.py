@@ -12,7 +12,7 @@ from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 from snn_fusion_failure.records.ceilings import CEILINGS, score
-from snn_fusion_failure.records.rows import summarize
+from snn_fusion_failure.records.rows import commits, summarize
 from snn_fusion_failure.runs.origin import commit
 
 if TYPE_CHECKING:
@@ -263,8 +263,8 @@ def collect(
             unit = "%" if metric.startswith("accuracy") else "1"
             cell: dict[str, Any] = {"row": row, "model": model, "metric": metric, "unit": unit}
             cell |= {"seeds": order} | summarize(values)
-            if commits := sorted({by_seed[s]["git"] for s in order if "git" in by_seed[s]}):
-                cell["git"] = ", ".join(commits)
+            if made := commits(by_seed.values()):
+                cell["git"] = made
             column = "baseline" if model == "equal_weights" else model
             if metric == "accuracy" and column in printed["columns"]:
                 cell["source"] = printed["rows"][row][printed["columns"].index(column)]

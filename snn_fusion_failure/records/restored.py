@@ -1,4 +1,4 @@
-"""Single runs of Tables 3.1 to 3.6 from the tables of record, so that a clone can add seeds.
+"""Single runs from the tables of record, so that a clone can add seeds to them.
 
 A training costs up to a minute and its file stays on the machine that made it; its scores are in
 `results/`, seed by seed. Written back as files, they are not trained again. What the tables do not
@@ -58,6 +58,16 @@ def _channel(run: fusion_tables.Run, weights: Scores) -> dict[str, Any]:
     return {"channel": {"name": channel, "means_only": True, **found}}
 
 
+def held_scores(path: Path) -> dict[tuple[str, str, int], dict[str, Any]]:
+    """(row, model, seed) -> metric -> value, and `git`, of a table of record."""
+    held: dict[tuple[str, str, int], dict[str, Any]] = {}
+    for row in rows_with_origin(path):
+        for seed, value in values_by_seed(row).items():
+            record = held.setdefault((row["row"], row["model"], seed), {"git": row["git"]})
+            record[row["metric"]] = value
+    return held
+
+
 def restore(tables: Sequence[str], results: Path, out: Path, seeds: int) -> int:
     """Write the single runs that `results` holds and `out` lacks; returns their number.
 
@@ -71,11 +81,7 @@ def restore(tables: Sequence[str], results: Path, out: Path, seeds: int) -> int:
     weights = _scores(results / "study_channel_weights.json")
     written = 0
     for table in tables:
-        held: dict[tuple[str, str, int], dict[str, Any]] = {}
-        for row in rows_with_origin(results / f"table_{table.replace('.', '_')}.json"):
-            for seed, value in values_by_seed(row).items():
-                record = held.setdefault((row["row"], row["model"], seed), {"git": row["git"]})
-                record[row["metric"]] = value
+        held = held_scores(results / f"table_{table.replace('.', '_')}.json")
         for run in fusion_tables.runs(table, seeds):
             scores = held.get((run.row.name, run.model, run.seed), {})
             if "accuracy" not in scores or run.path(out).exists():

@@ -60,6 +60,12 @@ def values_by_seed(cell: Mapping[str, Any]) -> dict[int, float]:
     return dict(zip(cell.get("seeds", range(len(values))), values, strict=True))
 
 
+def commits(records: Iterable[Mapping[str, Any]]) -> str:
+    """The commits that made single runs, each once; '' where none is known."""
+    named = {name for record in records for name in str(record.get("git", "")).split(", ")}
+    return ", ".join(sorted(named - {""}))
+
+
 def compare_columns(
     rows: Iterable[Mapping[str, Any]], compared: Iterable[Compared]
 ) -> list[dict[str, Any]]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import shutil
 from pathlib import Path
 from typing import Any
 
@@ -65,6 +66,11 @@ def test_single_runs_become_differences_with_holms_p_values(tmp_path: Path) -> N
     # The smallest of three comparisons: both above equal weights, and one above the other.
     assert len(held["comparisons"]) == 3
     assert tested["p_holm"] == pytest.approx(3 * tested["p_value"])
+    # A machine that has the table only goes on from it, to the same numbers.
+    shutil.rmtree(tmp_path / "runs")
+    study.main(dataclasses.replace(config, restore=True))
+    again = json.loads((tmp_path / "results" / "study_driver_heads.json").read_text())
+    assert (again["rows"], again["comparisons"]) == (held["rows"], held["comparisons"])
 
 
 def test_runs_go_on_after_an_interruption_and_the_table_is_there_after_each(

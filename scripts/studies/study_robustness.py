@@ -5,12 +5,16 @@
     python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test
     python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test \
         --fold seed
+    python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test \
+        --models avod avod_argate --levels 1 3 5
 
 trains every model on the same frames with the same failures (one sensor fails in two thirds of
 them), measures 3D moderate R40 with all sensors working and in every cell of failure and severity,
 and writes `results/study_robustness.json` (`_val` is added to tables of validation frames, on
 which settings are chosen), with paired differences of clean frames and means seed by seed, p values
-corrected over all of them.
+corrected over all of them. Without `--steps` a model has its preset's, 2,000 (`avod`) and 6,000
+(`dense`) at `small`. Only rows of `--models` are written, all others stay as they are in the table;
+where the cells of `dense` are not in `--out`, the corruption error is taken against its rows there.
 
 `dense_oracle` is told which sensor fails and how severely: no gate of this network can know more.
 `camera_only` and `lidar_only` are the trained `dense` with the fusion weights fixed at (1, 0) and
@@ -38,6 +42,7 @@ from snn_fusion_failure.commands.detector_cells import (
     measure_cells,
     read_cells,
     read_frames,
+    recorded_cells,
 )
 from snn_fusion_failure.commands.detector_robustness import summarize_cells
 from snn_fusion_failure.records.detector_folds import FOLDS
@@ -75,6 +80,7 @@ class Config:
     models: tuple[choices.Model, ...] = MODELS
     size: choices.SizeOption = "small"
     steps: int | None = None
+    """Of all models; each its preset's when left out."""
     levels: tuple[int, ...] = (1, 2, 3, 4, 5)
     """Severities in fifths."""
     kinds: tuple[str, ...] = ()
@@ -237,8 +243,13 @@ def _rows_of(
     return rows | {row: _means(found, base, group) for row, group in groups.items() if group}
 
 
+def _table(config: Config) -> Path:
+    name = config.name if config.split == "test" else f"{config.name}_val"
+    return config.results / f"{name}.json"
+
+
 def scores(config: Config) -> dict[tuple[str, str], dict[int, dict[str, float]]]:
-    """(row, model) -> seed -> metric -> value, of every training whose cells are complete.
+    """(row, model) -> seed -> metric -> value, of the trainings whose cells are complete.
 
     Where a seed was trained with several folds, its value is their mean.
     """
@@ -249,7 +260,10 @@ def scores(config: Config) -> dict[tuple[str, str], dict[int, dict[str, float]]]
     for seed, fold in itertools.product(seeds, (None, *range(len(FOLDS)))):
         baseline = Training(BASELINE, seed, fold).folder(config) / f"cells_{config.split}"
         base = read_cells(baseline, wanted)
-        for model in MODELS:
+        if base is None and fold is None:
+            base = recorded_cells(_table(config), BASELINE, seed, wanted)
+        # Models of another command keep their rows and the command that made them.
+        for model in config.models:
             training = Training(model, seed, fold)
             for name, _, kept in _variants(config, training):
                 found = read_cells(kept, wanted)
@@ -280,11 +294,11 @@ def main(config: Config) -> dict[str, Any]:
     """Do the trainings and cells that are missing, then write the tables."""
     done = 0 if config.collect_only else execute(config)
     rows = collect(config)
-    table = config.name if config.split == "test" else f"{config.name}_val"
     if rows:
         title = f"Car detection by sensor failure and severity ({config.split} frames)"
+        table = _table(config)
         record_table(
-            config.results / f"{table}.json", table, title, rows, preset=config.size,
+            table, table.stem, title, rows, preset=config.size,
             compared=[Compared(METRIC, PAIRS, rows=GROUPS)],
         )  # fmt: skip
     fields = {

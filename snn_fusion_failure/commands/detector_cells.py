@@ -13,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any, NamedTuple
 
+from snn_fusion_failure.records.rows import recorded, values_by_seed
 from snn_fusion_failure.runs import write_json
 
 METRIC = "3d_moderate_r40"
@@ -152,3 +153,20 @@ def read_cells(folder: Path, cells: Sequence[Cell]) -> dict[Cell, dict[str, floa
                 scores["failed_auroc"] = auroc(told, np.asarray(clean["failed"])[:, sensor])
         found[cell] = scores
     return found
+
+
+def recorded_cells(
+    table: Path, model: str, seed: int, cells: Sequence[Cell]
+) -> dict[Cell, dict[str, float]] | None:
+    """Average precision of each cell by a table of record; None where one lacks this seed.
+
+    Models are measured months apart, on machines that hold no runs of each other.
+    """
+    rows = {
+        row["row"]: values_by_seed(row)
+        for row in recorded(table)
+        if row["model"] == model and row["metric"] == METRIC
+    }
+    if any(seed not in rows.get(cell.name, {}) for cell in cells):
+        return None
+    return {cell: {METRIC: rows[cell.name][seed]} for cell in cells}

@@ -5,10 +5,13 @@ from __future__ import annotations
 import dataclasses
 import json
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
 from fusion.detection.learning.training import SENSOR_FAILURES
+from fusion.detection.presets import preset
+from snn_fusion_failure.commands import detector_runs as runs
 from snn_fusion_failure.commands.detector_cells import Cell, read_cells
 from tests._scripts import load_script
 from tests.snn_fusion_failure.test_train_detector import write_frame
@@ -91,6 +94,57 @@ def test_rows_are_means_of_the_cells(tmp_path: Path) -> None:
     assert found["clean", "dense_argate - dense"] == pytest.approx(10.0)
 
 
+def test_each_model_is_trained_as_long_as_its_preset_says(tmp_path: Path) -> None:
+    config = study.Config(tmp_path, seeds=1)
+    found = {}
+    for training in study.trainings(config):
+        made = preset("small", training.model).config
+        cache = SimpleNamespace(size="small", config=lambda model, made=made: made)
+        setup = runs.build(study._options(config, training), cache)
+        assert setup.train.failure_share == pytest.approx(2 / 3)
+        found[training.model] = setup.train.steps, setup.train.batch_size
+    assert found == {
+        "avod": (2000, 1), "avod_argate": (2000, 1),
+        "dense": (6000, 2), "dense_argate": (6000, 2), "dense_oracle": (6000, 2),
+    }  # fmt: skip
+
+
+def test_models_measured_later_are_scored_against_the_baseline_on_record(tmp_path: Path) -> None:
+    config = _config(tmp_path)
+    cells = study.cells(config)
+    kept = study.Training("dense", 0, None).folder(config) / "cells_test"
+    for cell, value in zip(cells, (50, 40, 30, 20, 10), strict=True):
+        _write(kept, cell, value, (0.5, 0.5))
+    study.main(config)
+    path = tmp_path / "results" / "study_robustness.json"
+    before = json.loads(path.read_text())["rows"]
+
+    # Another machine: the table is here, the runs of the baseline are not.
+    elsewhere = dataclasses.replace(config, out=tmp_path / "other", models=("avod", "avod_argate"))
+    for model, lower in (("avod", 5), ("avod_argate", 0)):
+        for seed in (0, 1):
+            kept = study.Training(model, seed, None).folder(elsewhere) / "cells_test"
+            for cell, value in zip(cells, (50, 40, 30, 20, 10), strict=True):
+                _write(kept, cell, value - lower, (0.5, 0.5))
+    study.main(elsewhere)
+    rows = json.loads(path.read_text())["rows"]
+    assert rows[: len(before)] == before
+    held = {(r["row"], r["model"], r["metric"]): r["values"] for r in rows}
+    # The baseline has no seed 1, and an error against one seed of two would be no column's mean.
+    assert held["seen kinds", "avod", "3d_moderate_r40"] == [20, 20]
+    assert ("seen kinds", "avod", "mce") not in held
+    study.main(dataclasses.replace(elsewhere, seeds=1))
+    held = {(r["row"], r["model"], r["metric"]): r["values"]
+            for r in json.loads(path.read_text())["rows"]}  # fmt: skip
+    assert held["seen kinds", "avod", "mce"] == pytest.approx([0.5 * (140 / 130 + 180 / 170)])
+    assert held["seen kinds", "avod_argate", "mce"] == [1.0]
+
+    # What other models have on disk by now is not written under this command's name.
+    _write(study.Training("dense", 0, None).folder(config) / "cells_test", Cell(), 1.0, (0.5, 0.5))
+    study.main(dataclasses.replace(elsewhere, out=config.out))
+    assert json.loads(path.read_text())["rows"][: len(before)] == before
+
+
 @pytest.mark.slow
 @pytest.mark.relaxed
 def test_tiny_frames_go_all_the_way(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
@@ -101,14 +155,14 @@ def test_tiny_frames_go_all_the_way(tmp_path: Path, capsys: pytest.CaptureFixtur
     (root / "ImageSets" / "train.txt").write_text("000000\n000001\n")
     (root / "ImageSets" / "val.txt").write_text("000002\n000003\n")
     options = study.Config(
-        root, seeds=1, models=("dense", "dense_oracle"), size="tiny", steps=4, levels=(5,),
-        kinds=("camera_blackout", "lidar_loss"), fold="1", any_size=True,
+        root, seeds=1, models=("dense", "dense_oracle", "avod", "avod_argate"), size="tiny",
+        steps=4, levels=(5,), kinds=("camera_blackout", "lidar_loss"), fold="1", any_size=True,
         out=tmp_path / "runs", results=tmp_path / "results",
     )  # fmt: skip
     study.main(options)
     table = json.loads((tmp_path / "results" / "study_robustness_val.json").read_text())
     rows = {(row["row"], row["model"]) for row in table["rows"]}
-    for model in ("dense", "dense_oracle", "camera_only", "lidar_only"):
+    for model in ("dense", "dense_oracle", "camera_only", "lidar_only", "avod", "avod_argate"):
         assert {("clean (folds)", model), ("seen kinds (folds)", model)} <= rows
         assert ("unseen kinds", model) in rows  # the blackout, which fold 1 leaves out
     run = tmp_path / "runs" / "tiny" / "dense_fold1_s0"
@@ -117,6 +171,10 @@ def test_tiny_frames_go_all_the_way(tmp_path: Path, capsys: pytest.CaptureFixtur
     assert "lidar_loss" in settings["failure_kinds"]
     held = json.loads((run / "cells_val_camera_only" / "lidar_loss_5.json").read_text())
     assert held["weights"] == [[1.0, 0.0]] * 2 and held["failed"] is None
+    # The same cells and scores of the two-stage models; without a gate there is no weight to score.
+    metrics = {(row["model"], row["metric"]) for row in table["rows"]}
+    assert ("avod", "mce") in metrics and ("avod_argate", "mce") in metrics
+    assert ("avod_argate", "weight_auroc") in metrics and ("avod", "weight_auroc") not in metrics
     # Without its camera's failure the oracle weighs as the clean frames say.
     oracle = tmp_path / "runs" / "tiny" / "dense_oracle_fold1_s0" / "cells_val"
     weights = [json.loads((oracle / f"{n}.json").read_text())["weights"][0]

@@ -5,13 +5,16 @@
     python scripts/studies/study_sensors.py --study driver_tagged
     python scripts/studies/study_sensors.py --study known_readings
     python scripts/studies/study_sensors.py --study kept_out_kinds --seeds 2
+    python scripts/studies/study_sensors.py --study har_long
     python scripts/studies/study_sensors.py --study gate_targets
 
 `driver_heads` has the rows of Table 3.5, for choices on validation rows (the table itself is made
 by `reproduce.py`); `driver_trip` holds out whole trips; `driver_tagged` has the earlier stand-ins,
 one of which names trips; `known_readings` lets sensors fail on values that they give when they
 work, with and without the feature that tells known readings; `kept_out_kinds` trains HAR on all
-kinds of failure but one and tests on that one; `gate_targets` compares what a gate can learn from.
+kinds of failure but one and tests on that one; `har_long` trains HAR four times as long as the
+preset, beside networks that serve one sensor each; `gate_targets` compares what a gate can learn
+from.
 
 Nothing is chosen here: a run trains the preset for all of its epochs and is scored once, on the
 test rows, or with `--validation` on training rows that `--split-seed` draws and no training sees.
@@ -55,7 +58,8 @@ class Config:
     """Run one of the studies."""
 
     study: str = "driver_trip"
-    """driver_heads, driver_trip, driver_tagged, known_readings, kept_out_kinds or gate_targets."""
+    """driver_heads, driver_trip, driver_tagged, known_readings, kept_out_kinds, har_long or
+    gate_targets."""
     preset: str = "paper"
     seeds: int = 5
     """Trainings per cell."""
@@ -135,14 +139,19 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
         train_and_test,
     )
     from snn_fusion_failure.records.ceilings import CEILINGS, score
+    from snn_fusion_failure.records.dedicated import dedicated
 
     start = time.process_time()
-    model = "argate_plus" if run.model in CEILINGS else run.model
+    model = "argate_plus" if run.model in (*CEILINGS, "dedicated") else run.model
     options = RunConfig(model=model, preset=preset, seed=run.seed, **run.case.options)
     (case,) = build_cases(options, dataset).values()
     found: dict[str, Any]
     if run.model in CEILINGS:
         found = dict(score(run.model, dataset, case.noise, run.seed))
+    elif run.model == "dedicated":
+        found = dedicated(
+            dataset, case.noise, run.seed, preset=preset, epochs=run.case.options.get("epochs")
+        )
     else:
         noise = dataclasses.replace(case.noise, test_kind=run.case.test_kind)
         settings = build_settings(options, dataset)

@@ -57,6 +57,10 @@ RULES = (
         "--preset quick --seeds 1 --models argate_l --rows masks --results runs",
     ),
     Rule(
+        "study_sensors.py har_long",
+        "--preset quick --seeds 1 --models linear_fit --rows 'n_clean=5 uniform' --results runs",
+    ),
+    Rule(
         "study_sensors.py",
         "--preset quick --seeds 1 --models argate_plus --rows zero --results runs",
     ),

@@ -38,6 +38,13 @@ def _grid(**options: Any) -> list[Case]:
     ]
 
 
+def _long(name: str, n_clean: int, *bounds: str) -> Case:
+    """Four times the epochs of the preset: with few clean sensors each is seldom seen alone."""
+    options = {"dataset": "har", "protocol": "random", "n_clean": n_clean, "epochs": 60}
+    columns = ("baseline", "argate_plus", "argate_l", "oracle", *bounds)
+    return Case(name, options, (*columns, "nearest_rows", "linear_fit"))
+
+
 _GATES = {
     "as in the preset": (),
     "kl": ("model.loss.imitation=kl",),
@@ -90,6 +97,10 @@ STUDIES: dict[str, tuple[str, list[Case]]] = {
             for kept in KINDS
         ],
     ),
+    "har_long": (
+        "HAR, trainings of 60 epochs instead of 15, accuracy %",
+        [_long("n_clean=5 uniform", 5), _long("n_clean=1 uniform", 1, "dedicated")],
+    ),
     "gate_targets": (
         "What the gate of ARGate-L learns from, HAR, validation subjects, accuracy %",
         [
@@ -108,6 +119,7 @@ STUDIES: dict[str, tuple[str, list[Case]]] = {
 PAIRS = (
     *((m, "equal_weights") for m in (*_COLUMNS[1:6], "oracle")),
     ("argate_l", "argate_plus"),
+    *((m, "baseline") for m in ("argate_plus", "argate_l")),
     *((m, f"{m}_printed") for m in ("argate_plus", "argate_l")),
 )
 """Columns that are compared seed by seed."""

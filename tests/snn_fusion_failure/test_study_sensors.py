@@ -8,13 +8,15 @@ import shutil
 from pathlib import Path
 from typing import Any
 
+import jax
+import jax.numpy as jnp
 import numpy as np
 import pytest
 
 from fusion.data import from_arrays, load
-from fusion.failures import no_failure
+from fusion.failures import corrupt, no_failure, random_failing
 from fusion.loop import Corruption
-from snn_fusion_failure.records import ceilings, fusion_tables, sensor_cases
+from snn_fusion_failure.records import ceilings, dedicated, fusion_tables, sensor_cases
 from snn_fusion_failure.runs import write_json
 from tests._scripts import load_script
 
@@ -124,6 +126,40 @@ def test_the_validation_rows_are_training_rows_that_the_seed_draws(
     assert not held & {float(v) for v in parts[0].train_x[:, 0, 0]}
     for part in parts:  # 15 of each class are expected, with a standard deviation below 3.4
         assert np.bincount(part.test_y, minlength=4).min() >= 5
+
+
+def test_a_dedicated_network_answers_where_its_sensor_is_left(
+    monkeypatch: pytest.MonkeyPatch,
+) -> None:
+    rng = np.random.default_rng(0)
+    data = from_arrays(rng.normal(size=(600, 3, 4)).astype(np.float32), np.arange(600) % 4)
+
+    def predicted(part: Any, *_: Any) -> np.ndarray:
+        if part.n_channels == 3:
+            return data.test_y
+        # The networks of the sensors are right, right in every class but 0, and never.
+        (sensor,) = (data.channels.index(name) for name in part.channels)
+        np.testing.assert_array_equal(part.test_x[:, 0], data.test_x[:, sensor])
+        np.testing.assert_array_equal(part.scale.low, data.scale.low[sensor : sensor + 1])
+        return (data.test_y, np.maximum(data.test_y, 1), (data.test_y + 1) % 4)[sensor]
+
+    monkeypatch.setattr(dedicated, "_predicted", predicted)
+    alone = random_failing(data.channels, n_clean=1)
+    noise = Corruption(alone, alone, "uniform")
+    found = dedicated.dedicated(data, noise, 0, preset="quick")
+    key = jax.random.fold_in(jax.random.key(0), 3)
+    failed = np.asarray(corrupt(alone, jnp.asarray(data.test_x), "uniform", key=key)[1])
+    works = ~failed[failed.any(1)]
+    y = data.test_y[failed.any(1)]
+    right = works[:, 0] | (works[:, 1] & (y > 0))
+    assert 0.4 < right.mean() < 0.8
+    assert found["accuracy_clean"] == 100.0
+    assert found["accuracy_corrupted"] == pytest.approx(100.0 * right.mean())
+    both = random_failing(data.channels, n_clean=2)
+    with pytest.raises(
+        ValueError, match=r"noise\.test\.low=1, noise\.test\.high=1: expected 2 of 3"
+    ):
+        dedicated.dedicated(data, Corruption(both, both, "uniform"), 0, preset="quick")
 
 
 def test_neighbours_are_looked_up_for_drawn_rows(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -172,6 +172,11 @@ class ModelConfig:
         return self.gate_kind != "deterministic"
 
     @property
+    def reads_failed(self) -> bool:
+        """Is the network told which sensors failed: the oracle's gate is, no other part is."""
+        return MODELS[self.model].gate == "oracle"
+
+    @property
     def recipe(self) -> Recipe:
         """The model's recipe, with the loss of this config where it has one."""
         base = MODELS[self.model]

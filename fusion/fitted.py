@@ -15,10 +15,11 @@ from jaxtyping import Array, Bool, Float, Key
 
 from fusion._array_files import build, flatten, read_arrays, unflatten, write_arrays
 from fusion._checks import check_mask, check_type
+from fusion._inputs import check_windows
 from fusion.config import ModelConfig
 from fusion.data.dataset import Dataset, Scale, apply_scale
 from fusion.loop import Corruption, test_output
-from fusion.models import Params, check_windows, export, predict
+from fusion.models import Params, export, predict
 from fusion.monitor import MonitorParams, failure_probability, fit_monitor
 from fusion.predictive_scores import fit_temperature
 from fusion.train import TrainState
@@ -64,7 +65,7 @@ def classify(
 ) -> tuple[Array, Array, Array]:
     """Class probabilities, fusion weights and failure probabilities of scaled windows."""
     absent = jnp.any(jnp.isnan(x), axis=-1)
-    out = predict(config, main, x, absent)
+    out = predict(config, main, x, absent if config.reads_failed else None)
     calls = jnp.where(
         absent, jnp.ones_like(out.weights), failure_probability(monitor, out.features)
     )

@@ -93,7 +93,11 @@ def _epoch(model: ModelConfig, config: TrainConfig, n: int) -> Callable[..., Any
 
 @functools.lru_cache(maxsize=32)
 def _evaluate(model: ModelConfig) -> Callable[..., Any]:
-    return jax.jit(lambda main, x, failed: predict_batches(model, main, x, failed))
+    return jax.jit(
+        lambda main, x, failed: predict_batches(
+            model, main, x, failed if model.reads_failed else None
+        )
+    )
 
 
 _corrupt = jax.jit(corrupt, static_argnums=(0, 2))

@@ -14,7 +14,8 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Bool, Float, Key
 
-from fusion._checks import check_array, check_key, check_mask
+from fusion._checks import check_key, check_mask
+from fusion._inputs import check_read, check_windows
 from fusion.bayesian_gate import VariationalGate
 from fusion.config import ModelConfig
 from fusion.encoders import encoder
@@ -205,11 +206,14 @@ def predict(
         config: static.
         main: `export(params)`.
         x: windows, `[batch, sensor, time]`, scaled to [-1, 1].
-        failed: which sensors failed; the oracle gate reads it, the other models are not told.
+        failed: which sensors failed, for the oracle gate only (`config.reads_failed`); the other
+            models find out by themselves. To tell any model that a sensor is dead, give
+            `available`.
         available: False for sensors that sent nothing; all are there when None.
-        excluded: rows of the memory that an example may not see, such as itself in training
-            (neighbourhood head only).
+        excluded: rows of the memory that an example may not see, such as itself in training, for a
+            neighbourhood head only.
         weights: fusion weights in place of the gate's own; those of absent sensors are taken out.
+            Given with `failed`, which they would hide, they are refused.
         key: PRNG key of dropout, random fusion and draws of a variational gate, in training only;
             without it a variational gate has its mean parameters.
 
@@ -217,7 +221,8 @@ def predict(
         Logits, fusion weights and features.
 
     Raises:
-        ValueError: a shape that is not the model's, a legacy key, an oracle without `failed`.
+        ValueError: a shape that is not the model's, a legacy key, an oracle without `failed`,
+            `failed` or `excluded` for a model that does not read them.
 
     Example:
         >>> config = ModelConfig("netgated", n_sensors=3, n_times=1, n_classes=2)
@@ -232,6 +237,7 @@ def predict(
     for name, mask in (("failed", failed), ("available", available), ("weights", weights)):
         if mask is not None:
             check_mask(name, mask, x.shape[:2], numbers=name == "weights")
+    check_read(config, failed, excluded, weights)
     if key is None:
         there = ~jnp.any(jnp.isnan(x), axis=-1)
         available = there if available is None else available & there
@@ -252,25 +258,6 @@ def predict(
     net = FusionNet(config)
     inputs = x, key, failed, available, memory, excluded, weights
     return cast(MainOutput, net.apply({"params": main}, *inputs))
-
-
-def check_windows(config: ModelConfig, x: Any) -> None:
-    """Refuse windows of another shape than the model's, with the likely reason.
-
-    Raises:
-        ValueError: no batch axis, times before sensors, or other numbers of sensors or samples.
-        TypeError: no array, or one of texts.
-    """
-    check_array("x", x)
-    k, t = config.n_sensors, config.n_times
-    if x.ndim == 3 and x.shape[1:] == (k, t):
-        return
-    fix = "the model was made for other sensors or windows"
-    if x.shape == (k, t):
-        fix = "add the batch axis: x[None]"
-    elif x.ndim == 3 and x.shape[1:] == (t, k):
-        fix = "sensors come before samples: x.transpose(0, 2, 1)"
-    raise ValueError(f"x.shape={tuple(x.shape)}: expected [batch, {k} sensors, {t} samples]; {fix}")
 
 
 def auxiliary_logits(

@@ -103,9 +103,10 @@ def _fit(
     for i, (kind, noise_key) in enumerate(zip(kinds, keys, strict=True)):
         here = failed & (kind_of == i)[:, None]
         broken = apply_failure(broken, here, kind, key=noise_key)
-    oracle = jnp.zeros((n, k), bool)
-    working = predict(config, main, x, oracle).features
-    features = predict(config, main, broken, oracle).features
+    # Weights are not looked at, so the oracle may take all sensors for working ones.
+    none = jnp.zeros((n, k), bool) if config.reads_failed else None
+    working = predict(config, main, x, none).features
+    features = predict(config, main, broken, none).features
     mean = jnp.mean(features, axis=1)
     spread = jnp.std(features, axis=1) + 1e-6
     z = (features - mean[:, None, :]) / spread[:, None, :]

@@ -98,11 +98,14 @@ def batch_loss(
 ) -> tuple[Float[Array, ""], tuple[LossTerms, MainOutput]]:
     """The training loss of one batch, with its terms and the main model's output.
 
-    Differentiable in `params` and in `hyper.loss`; see `fusion.losses.argate_loss`. A variational
+    `failed` is a part of the batch, as in `fusion.failures.corrupt`: the oracle's gate and mask
+    supervision read it, the metrics of a step do for all models. Differentiable in `params` and in
+    `hyper.loss`; see `fusion.losses.argate_loss`. A variational
     gate adds its divergence from the prior over `n_examples`, the training rows; over the rows of
     the batch when None.
     """
-    out = predict(model, export(params), x, failed, excluded=excluded, key=key)
+    told = failed if model.reads_failed else None
+    out = predict(model, export(params), x, told, excluded=excluded, key=key)
     aux_losses = targets = None
     config = model.recipe.loss
     if config.auxiliary:
@@ -114,8 +117,8 @@ def batch_loss(
             targets = apply_targets(model.targets, params["targets"], given)
     loss = argate_loss(config, hyper.loss, out.logits, y, out.weights, aux_losses, targets)
     if config.mask_supervision:
-        told = jnp.mean(mask_penalty(out.weights, failed))
-        loss = loss._replace(total=loss.total + hyper.loss.mask * told)
+        penalty = jnp.mean(mask_penalty(out.weights, failed))
+        loss = loss._replace(total=loss.total + hyper.loss.mask * penalty)
     if model.variational:
         apart = gate_divergence(params["main"]["gate"], model.gate_prior) / (n_examples or len(y))
         loss = loss._replace(total=loss.total + hyper.loss.divergence * apart)
@@ -179,7 +182,8 @@ def train_step(
     if model.recipe.loss.target_training == "held_out":
 
         def terms_of(params: Params, batch: tuple[Array, ...]) -> LossTerms:
-            of: dict[str, Any] = {"excluded": batch[3], "n_examples": n_examples}
+            hidden = None if excluded is None else batch[3]
+            of: dict[str, Any] = {"excluded": hidden, "n_examples": n_examples}
             return batch_loss(model, hyper, params | seen, *batch[:3], **of)[1][0]
 
         seen_by = jnp.zeros((len(y), 1), bool) if excluded is None else excluded

@@ -53,7 +53,8 @@ def _auxiliary_logits(model: Any) -> Any:
     from fusion.models import auxiliary_logits, export, predict
 
     def logits(params: Any, x: Any, failed: Any) -> Any:
-        features = predict(model, export(params), x, failed).features
+        told = failed if model.reads_failed else None
+        features = predict(model, export(params), x, told).features
         return auxiliary_logits(model, params, x, features)
 
     return jax.jit(logits)

@@ -19,6 +19,7 @@ from fusion.models import (
     init,
     predict,
 )
+from fusion.prediction import predict_batches
 from fusion.sizes import count_parameters, match_parameters
 
 SMALL = ModelConfig(
@@ -61,6 +62,7 @@ def test_export_gives_the_same_logits_to_the_bit(name: str) -> None:
     config = dataclasses.replace(SMALL, model=name)
     params = init(jax.random.key(0), config)
     recipe = MODELS[name]
+    told = FAILED if config.reads_failed else None
     assert set(params) == {"main"} | ({"aux"} if recipe.loss.auxiliary else set()) | (
         {"targets"} if recipe.loss.learned_targets else set()
     )
@@ -68,7 +70,7 @@ def test_export_gives_the_same_logits_to_the_bit(name: str) -> None:
     @jax.jit
     @chex.assert_max_traces(n=1)
     def in_training(params: dict) -> jax.Array:
-        out = predict(config, params["main"], X, FAILED)
+        out = predict(config, params["main"], X, told)
         if recipe.loss.auxiliary:
             assert auxiliary_logits(config, params, X, out.features).shape == (7, 3, 4)
         return out.logits
@@ -76,7 +78,7 @@ def test_export_gives_the_same_logits_to_the_bit(name: str) -> None:
     main = export(params)
     names = {jax.tree_util.keystr(path) for path, _ in jax.tree_util.tree_leaves_with_path(main)}
     assert not any("aux" in n or "lattice" in n for n in names)
-    exported = jax.jit(lambda main: predict(config, main, X, FAILED).logits)(main)
+    exported = jax.jit(lambda main: predict(config, main, X, told).logits)(main)
     np.testing.assert_array_equal(exported, in_training(params))
 
 
@@ -109,6 +111,29 @@ def test_oracle_needs_the_mask_and_uses_it() -> None:
     a = predict(config, export(params), X, FAILED).logits
     b = predict(config, export(params), X.at[:, 0].set(0.7), FAILED).logits
     np.testing.assert_array_equal(a, b)
+
+
+@pytest.mark.parametrize("name", [n for n in MODELS if n != "oracle"])
+def test_a_mask_that_a_model_cannot_read_is_refused(name: str) -> None:
+    config = dataclasses.replace(SMALL, model=name)
+    assert not config.reads_failed
+    wanted = r"failed=mask of \(7, 3\): expected None for model='.*give available=~failed"
+    with pytest.raises(ValueError, match=wanted):
+        predict(config, {}, X, FAILED)
+    with pytest.raises(ValueError, match=wanted):
+        jax.eval_shape(lambda x: predict_batches(config, {}, x, FAILED), X)
+
+
+def test_what_would_hide_a_mask_or_have_no_use_for_it_is_refused() -> None:
+    oracle = dataclasses.replace(SMALL, model="oracle")
+    assert oracle.reads_failed
+    with pytest.raises(ValueError, match="expected None beside weights"):
+        predict(oracle, {}, X, FAILED, weights=jnp.ones((7, 3)))
+    with pytest.raises(ValueError, match="failed=None: expected the mask"):
+        # Without a mask all sensors were once taken for working ones.
+        predict_batches(oracle, export(init(jax.random.key(0), oracle)), X)
+    with pytest.raises(ValueError, match=r"excluded=mask of \(7, 7\): expected None for head="):
+        predict(SMALL, {}, X, excluded=jnp.eye(7, dtype=bool))
 
 
 def test_bad_configs_name_the_value_and_the_known_ones() -> None:

@@ -7,7 +7,8 @@ replaced by noise in two thirds of the windows, and ends with both accuracies be
 pictures, and a line `result: ...`: a minute and a half of CPU time. `--protocol` trains one case.
 `--preset quick` takes few epochs; the default `paper` has the settings of record. With
 `--dataset simulated` no data file is needed; `--data my.npz` takes your own windows: arrays `x`
-[N, K, T] and `y` [N], and if you like `groups` [N], `channels` [K] and `classes` [C]; and
+[N, K, T] and `y` [N], and if you like `groups` [N], `channels` [K] and `classes` [C], and keeps the
+trained networks in files that `fusion.FittedARGate.load` and `watch_sensors.py --model` read; and
 `--data FOLDER` takes sensors of unequal shapes from CSV files and a schema, see docs/data.md.
 """
 
@@ -19,6 +20,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.commands.argate_networks import keep, kept_sentence, network_files
 from snn_fusion_failure.commands.argate_report import ceiling_of, draw, printed, sentence, table
 from snn_fusion_failure.commands.argate_runs import (
     Case,
@@ -62,7 +64,7 @@ def forget_from(out: Path, case: str, epoch: int) -> None:
 def train_case(
     config: Config, settings: Any, dataset: Any, name: str, case: Case, out: Path
 ) -> tuple[dict[str, Any], Any, Any]:
-    """Train one case with a progress bar and score it: (scores, history, test output)."""
+    """Train one case with a progress bar and score it: (scores, fitted, test output)."""
     with progress() as bar:
         task = bar.add_task(f"{config.model} {name}", total=settings.train.epochs, status="")
         written = 0
@@ -91,7 +93,7 @@ def train_case(
         "source": printed(config, case.noise),
         "ceiling": ceiling_of(dataset, case.noise),
     }
-    return found, fitted.history, output
+    return found, fitted, output
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -131,20 +133,27 @@ def main(config: Config) -> dict[str, Any]:
 
     found: dict[str, dict[str, Any]] = {}
     trained: dict[str, list[Any]] = {}
+    files = network_files(config, cases, out)
     for name, case in cases.items():
-        found[name], *trained[name] = train_case(config, settings, dataset, name, case, out)
+        found[name], fitted, output = train_case(config, settings, dataset, name, case, out)
+        trained[name] = [fitted.history, output]
+        if name in files:
+            keep(files[name], settings, dataset, case, fitted.state, config.seed)
     summary = {
         **found[list(found)[-1]],
         "cases": found,
         "parameters": count_parameters(settings.model),
         "epochs": settings.train.epochs,
         "rows": "validation" if config.validation else "test",
+        "networks": {name: path.name for name, path in files.items()},
     }
     write_json(out / "result.json", summary | {"provenance": provenance()})
     draw(out, config, dataset, found, trained)
     print(table(found))
     print(sentence(config, settings, dataset, found))
     print(f"Pictures and result.json are in {out}.")
+    if files:
+        print(kept_sentence(files, summary["rows"]))
     fields = {}
     for name, row in found.items():
         fields["accuracy" if config.protocol else name] = row["accuracy"]

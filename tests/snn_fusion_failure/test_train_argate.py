@@ -14,6 +14,7 @@ from fusion.data import load
 from fusion.data.csv_folder import read_windows
 from fusion.fitted_sensors import FittedSensors
 from snn_fusion_failure.commands import train_argate
+from snn_fusion_failure.commands.argate_networks import kept_sentence, network_files
 from snn_fusion_failure.commands.argate_report import printed
 from snn_fusion_failure.commands.argate_runs import Config, build_cases, build_settings
 from snn_fusion_failure.records import fusion_tables
@@ -356,6 +357,16 @@ def test_a_folder_of_csv_files_is_trained_on(tmp_path: Path) -> None:
     told = dict(zip(ids, fitted.predict(windows).output.argmax(1), strict=True))
     whole = [line.split(",") for line in lines[1:] if line.endswith(",")]  # no sensor failed
     assert whole and all(fitted.names[told[name]] == said for name, said, _ in whole)
+
+
+def test_which_networks_are_kept(tmp_path: Path) -> None:
+    own = Config(data=tmp_path / "my.npz", model="netgated")
+    both = {name: tmp_path / f"model_{name}.npz" for name in ("clean", "random")}
+    assert network_files(own, ["clean", "random"], tmp_path) == both
+    assert "FittedARGate.load" in kept_sentence(both, "test")
+    assert network_files(own, ["random"], tmp_path) == {"random": tmp_path / "model.npz"}
+    assert network_files(dataclasses.replace(own, model="oracle"), ["random"], tmp_path) == {}
+    assert network_files(SMALL, ["random"], tmp_path) == {}
 
 
 def test_options_of_equal_windows_are_refused_for_a_folder(tmp_path: Path) -> None:

@@ -8,7 +8,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from fusion.data.own_file import read_recording
+from fusion.data.own_file import load_file, read_recording
 from fusion.fitted import FittedARGate
 from snn_fusion_failure.commands import train_argate, watch_sensors
 from snn_fusion_failure.commands.argate_runs import Config as TrainConfig
@@ -94,6 +94,15 @@ def test_own_windows_are_trained_on_from_the_shell(tmp_path: Path) -> None:
     x = rng.normal(size=(200, 3, 1)) + 2.0 * y[:, None, None]
     np.savez(tmp_path / "my.npz", x=x, y=y, channels=["a", "b", "c"])
     config = TrainConfig(data=tmp_path / "my.npz", preset="quick", out=tmp_path / "run")
-    found = train_argate.main(config)
+    found = train_argate.main(dataclasses.replace(config, protocol="clean"))
     assert found["cases"]["clean"]["accuracy"] > 80.0
     assert found["cases"]["clean"]["source"] is None
+    # The network that was scored is kept: the same accuracy on the same rows, in their own units.
+    assert found["networks"] == {"clean": "model.npz"}
+    fitted = FittedARGate.load(tmp_path / "run" / "model.npz")
+    assert fitted.channels == ("a", "b", "c") and fitted.classes == ("0", "1")
+    data = load_file(tmp_path / "my.npz")
+    low, high = data.scale.low[:, None], data.scale.high[:, None]
+    answer = fitted.predict((data.test_x + 1.0) / 2.0 * (high - low) + low)
+    hit = (answer.probabilities.argmax(1) == data.test_y).mean()
+    assert 100.0 * hit == pytest.approx(found["accuracy"], abs=1e-9)

@@ -1,7 +1,8 @@
 """The late-fusion HAR network in PyTorch, twice: as a user would write it, and with grouped layers.
 
 Both compute what `fusion.models.FusionNet` computes for `model="baseline"`; `load_parameters`
-copies the parameters of one into the other, so that the benchmark can show it.
+copies the parameters of one into the other, so that the benchmark can show it. `compile_problem`
+tells whether `torch.compile` can build programs here.
 """
 
 from __future__ import annotations
@@ -180,6 +181,24 @@ def load_parameters(net: LoopNet | GroupedNet, main: dict[str, Any]) -> None:
             for k, branch in enumerate(net.branches):
                 copy(getattr(branch, name).weight, kernel[k].T)
                 copy(getattr(branch, name).bias, bias[k])
+
+
+def compile_problem() -> str | None:
+    """Why `torch.compile` cannot build a program on this machine; None where it can.
+
+    On a CPU it writes C++ and needs a compiler; the least program shows whether all is there.
+    """
+    try:
+        torch.compile(lambda x: torch.sin(x) + 1.0)(torch.zeros(4))
+    except (
+        Exception
+    ) as error:  # its backends fail in many ways: no compiler, headers, another Python
+        first = next((line for line in str(error).splitlines() if line.strip()), "no reason given")
+        return (
+            f"torch.compile failed with {type(error).__name__}: {first.strip()}; install a C++ "
+            "compiler and the headers of this Python, or set CXX"
+        )
+    return None
 
 
 def train_epoch(

@@ -88,6 +88,7 @@ RULES = (
         needs="pytorch_lattice",
     ),
     Rule("bench_lattice.py", "--steps 2 --repeats 1"),
+    Rule("bench_streaming.py", "--slides 32 --turns 1"),
     Rule("simulate_kitti.py --picture", "--size tiny"),
     Rule("simulate_kitti.py", "--frames 2 --val 2 --test 2 --size tiny"),
     Rule("study_geometry.py", "--frames 2 --any-size"),
@@ -228,6 +229,7 @@ AREAS = {
     "sweeps": ("sweep", "bench_sweep"),
     "fusion": (
         "train_argate", "watch_sensors", "study_argate", "study_sensors", "bench_fusion",
+        "bench_streaming",
         "study_spiking_fusion", "study_rev_conv", "study_bayesian_gate", "bench_lattice",
         "reproduce",
     ),

@@ -50,7 +50,7 @@ from fusion.detection.learning.training import (
     learning_rate,
 )
 from fusion.detection.network.build import count_main_parameters, init_detector
-from fusion.detection.network.convolution import convolve
+from fusion.detection.network.convolution import convolve, low_convolve
 from fusion.detection.network.detector import fuse
 from fusion.detection.network.group_norm import GROUP_SIZE, group_norm_relu
 from fusion.detection.network.proposals import Detections, anchor_boxes, decode_second, final_boxes
@@ -168,6 +168,29 @@ def test_convolution_in_blocks_equals_the_plain_one(
         strict=True,
     ):
         np.testing.assert_allclose(ours, theirs, atol=2e-5)
+
+
+@pytest.mark.parametrize(("side", "padding"), [(3, 1), (2, 0)])
+def test_low_precision_rounds_factors_and_keeps_sums(side: int, padding: int) -> None:
+    def rounded(a: jax.Array) -> jax.Array:
+        return a.astype(jnp.bfloat16).astype(jnp.float32)
+
+    def plain(x: jax.Array, kernel: jax.Array) -> jax.Array:
+        return jax.lax.conv_general_dilated(
+            x, kernel, (1, 1), [(padding, padding)] * 2,
+            dimension_numbers=("NHWC", "HWIO", "NHWC"),
+        )  # fmt: skip
+
+    keys = jax.random.split(jax.random.key(0), 3)
+    x = jax.random.normal(keys[0], (2, 5, 6, 4))
+    kernel = jax.random.normal(keys[1], (side, side, 4, 5))
+    wanted, their_vjp = jax.vjp(plain, rounded(x), rounded(kernel))
+    got, our_vjp = jax.vjp(partial(low_convolve, padding=padding), x, kernel)
+    g = jax.random.normal(keys[2], got.shape)
+    # Sums in bfloat16 would be off by 2 % here, those of the weights' gradient by more.
+    for a, b in zip((got, *our_vjp(g)), (wanted, *their_vjp(rounded(g))), strict=True):
+        assert a.dtype == jnp.float32
+        np.testing.assert_allclose(a, b, atol=2e-5)
 
 
 def test_group_norm_equals_the_library_and_its_gradient() -> None:

@@ -15,6 +15,8 @@ in blocks; gradient of the weights 22 ms plain, 4.3 ms as nine products, 2.1 ms 
 
 from __future__ import annotations
 
+from functools import partial
+
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -89,6 +91,51 @@ def _narrow_bwd(kept: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
 _narrow.defvjp(_narrow_fwd, _narrow_bwd)
 
 
+def _rounded(x: Array, kernel: Array, padding: int) -> Array:
+    low = jnp.bfloat16
+    return jax.lax.conv_general_dilated(
+        x.astype(low), kernel.astype(low), (1, 1), [(padding, padding)] * 2,
+        dimension_numbers=("NHWC", "HWIO", "NHWC"), preferred_element_type=jnp.float32,
+    )  # fmt: skip
+
+
+@partial(jax.custom_vjp, nondiff_argnums=(2,))
+def low_convolve(
+    x: Float[Array, "b h w c"], kernel: Float[Array, "s s c f"], padding: int
+) -> Float[Array, "b h2 w2 f"]:
+    """Convolution of stride one with both factors rounded to bfloat16 and sums kept in float32.
+
+    So are those of the gradients (in reverse mode), for which the arriving gradient is rounded.
+
+    Args:
+        x: maps.
+        kernel: weights, of odd or even side.
+        padding: rows and columns of zeros around the map, static.
+    """
+    return _rounded(x, kernel, padding)
+
+
+def _low_fwd(x: Array, kernel: Array, padding: int) -> tuple[Array, tuple[Array, Array]]:
+    # What is kept for the way back takes half the memory.
+    kept = x.astype(jnp.bfloat16), kernel.astype(jnp.bfloat16)
+    return _rounded(*kept, padding), kept
+
+
+def _low_bwd(padding: int, kept: tuple[Array, Array], g: Array) -> tuple[Array, Array]:
+    x, kernel = kept
+    g = g.astype(jnp.bfloat16)
+    turned = kernel[::-1, ::-1].transpose(0, 1, 3, 2)
+    # The frames are the channels that are summed over, the gradient is the kernel.
+    of_kernel = jax.lax.conv_general_dilated(
+        x, g, (1, 1), [(padding, padding)] * 2,
+        dimension_numbers=("CHWN", "IHWO", "HWNC"), preferred_element_type=jnp.float32,
+    )  # fmt: skip
+    return _rounded(g, turned, kernel.shape[0] - 1 - padding), of_kernel
+
+
+low_convolve.defvjp(_low_fwd, _low_bwd)
+
+
 def convolve(
     x: Float[Array, "b h w c"], kernel: Float[Array, "3 3 c f"], precision: str = "float32"
 ) -> Float[Array, "b h w f"]:
@@ -97,9 +144,8 @@ def convolve(
     Args:
         x: maps.
         kernel: weights.
-        precision: of both factors; the result has that of `x` again.
+        precision: of both factors; sums and result are float32 in any case.
     """
     if precision == "bfloat16":
-        low = jnp.bfloat16
-        return _apply(x.astype(low), kernel.astype(low), (1, 1), 1).astype(x.dtype)
+        return low_convolve(x, kernel, 1)
     return _apply(x, kernel, (1, 1), 1) if kernel.shape[-1] >= _WIDE else _narrow(x, kernel)

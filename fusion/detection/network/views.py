@@ -11,7 +11,7 @@ import jax
 import jax.numpy as jnp
 from jaxtyping import Array, Float
 
-from fusion.detection.network.convolution import convolve
+from fusion.detection.network.convolution import convolve, low_convolve
 from fusion.detection.network.group_norm import group_norm_relu
 
 
@@ -52,15 +52,14 @@ class TransposedConv(nn.Module):
                                         jnp.array([0, 1, 1])].set(1.0)  # fmt: skip
         phases = jnp.einsum("mta,nub,mncf->tucabf", along, along, kernel)
         padded = jnp.pad(x, ((0, 0), (0, 1), (0, 1), (0, 0)))
-        dtype = jnp.dtype(self.precision)
-        y = jax.lax.conv_general_dilated(
-            padded.astype(dtype),
-            phases.reshape(2, 2, c, 4 * f).astype(dtype),
-            (1, 1),
-            "VALID",
-            dimension_numbers=("NHWC", "HWIO", "NHWC"),
-        )
-        y = y.astype(x.dtype).reshape(b, h, w, 2, 2, f).transpose(0, 1, 3, 2, 4, 5)
+        phases = phases.reshape(2, 2, c, 4 * f)
+        if self.precision == "bfloat16":
+            y = low_convolve(padded, phases, 0)
+        else:
+            y = jax.lax.conv_general_dilated(
+                padded, phases, (1, 1), "VALID", dimension_numbers=("NHWC", "HWIO", "NHWC")
+            )
+        y = y.reshape(b, h, w, 2, 2, f).transpose(0, 1, 3, 2, 4, 5)
         return y.reshape(b, 2 * h, 2 * w, f) + bias[None, None, None]
 
 

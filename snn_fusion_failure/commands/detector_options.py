@@ -58,6 +58,9 @@ class Train:
     seed: int = 0
     steps: int | None = None
     batch_size: int | None = None
+    """Frames a step; the preset's when left out."""
+    devices: int = 1
+    """Local devices that share the frames of a step, of which there must be a multiple."""
     learning_rate: float | None = None
     failures: bool = False
     """One sensor fails in two thirds of the training frames."""

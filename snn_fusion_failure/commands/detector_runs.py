@@ -19,7 +19,7 @@ from snn_fusion_failure.commands.detector_options import (
 from snn_fusion_failure.runs import apply_changes, to_jsonable
 
 # Options that do not change the numbers of a run.
-NOT_SETTINGS = ("out", "resume", "overwrite", "data", "cache", "checkpoint_every")
+NOT_SETTINGS = ("out", "resume", "overwrite", "data", "cache", "checkpoint_every", "devices")
 
 _OLD_NAMES = {"config": "model", "preset": "size"}  # of options, in runs until 0.2
 _OLD_OPTIONS = {

@@ -100,6 +100,7 @@ def train(config: Train) -> dict[str, Any]:
     enable_compilation_cache()
     from fusion.detection.learning.cache import TESTING, open_cache, read_example
     from fusion.detection.learning.fitting import fit_detector
+    from fusion.detection.learning.sharding import frame_mesh
     from fusion.detection.network.build import count_main_parameters
     from fusion.detection.plots import plot_training
 
@@ -107,6 +108,7 @@ def train(config: Train) -> dict[str, Any]:
         raise ValueError("split 'testing' has no labels to train on, expected a list of ImageSets")
     cache = open_cache(cache_folder(config))
     setup = build(config, cache)
+    frame_mesh(config.devices, setup.train.batch_size)  # before a folder is claimed
     names = cache.names(config.split)
     out = config.out or run_folder(config)
     chosen = {k: v for k, v in dataclasses.asdict(config).items() if k not in NOT_SETTINGS}
@@ -143,12 +145,11 @@ def train(config: Train) -> dict[str, Any]:
             read,
             seed=config.seed,
             on_report=show,
-            checkpoint_dir=checkpoints,
-            checkpoint_every=config.checkpoint_every,
+            checkpoint_dir=checkpoints, checkpoint_every=config.checkpoint_every,
             resume=config.resume,
-        )
-    if fitted.history:
-        plot_training(fitted.history).savefig(out / "training.png", dpi=120)
+            devices=config.devices,
+        )  # fmt: skip
+    plot_training(fitted.history).savefig(out / "training.png", dpi=120)
     first, last = fitted.history[0], fitted.history[-1]
     result = {
         "model": config.model,

@@ -67,6 +67,7 @@ from fusion.detection.learning.scoring import (
     precision_fields,
     weight_auroc,
 )
+from fusion.detection.learning.sharding import frame_mesh
 from fusion.detection.learning.training import (
     FAILURES,
     SENSOR_FAILURES,
@@ -117,6 +118,7 @@ __all__ = [
     "fit_detector",
     "flip",
     "frame_depth",
+    "frame_mesh",
     "frame_objects",
     "frame_order",
     "frame_part",

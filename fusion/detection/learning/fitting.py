@@ -16,6 +16,7 @@ from typing import Any, NamedTuple
 import jax
 import jax.numpy as jnp
 import numpy as np
+from jax.sharding import Mesh
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.learning.checkpoints import Checkpoints
@@ -25,6 +26,7 @@ from fusion.detection.learning.examples import Example, make_inputs, stack_examp
 from fusion.detection.learning.inference import detect
 from fusion.detection.learning.interrupts import interrupt_between_steps
 from fusion.detection.learning.params import DetectorParams
+from fusion.detection.learning.sharding import frame_mesh, in_shares, on_all, whole
 from fusion.detection.learning.training import (
     DetectorState,
     DetectorTrainConfig,
@@ -56,9 +58,13 @@ def restore_detector(config: DetectorConfig, folder: Path) -> DetectorState | No
 
 # One compiled program per network serves all seeds, rates and failures of a study.
 @functools.lru_cache(maxsize=8)
-def _step(config: DetectorConfig, train: DetectorTrainConfig) -> Callable[..., Any]:
-    step = functools.partial(train_step, config, train)
-    return jax.jit(step, donate_argnames="state")
+def _step(
+    config: DetectorConfig, train: DetectorTrainConfig, mesh: Mesh | None = None
+) -> Callable[..., Any]:
+    step = functools.partial(train_step, config, train, mesh=mesh)
+    if mesh is None:
+        return jax.jit(step, donate_argnames="state")
+    return jax.jit(step, donate_argnames="state", out_shardings=whole(mesh))
 
 
 @functools.lru_cache(maxsize=8)
@@ -105,6 +111,7 @@ def fit_detector(
     checkpoint_dir: Path | None = None,
     checkpoint_every: int = 500,
     resume: bool = False,
+    devices: int = 1,
 ) -> DetectorFit:
     """Train a detector.
 
@@ -118,16 +125,19 @@ def fit_detector(
         checkpoint_dir, checkpoint_every: where to keep checkpoints, steps between them; the last
             step and an interrupt save too.
         resume: go on from the newest checkpoint.
+        devices: local devices that share the frames of a step; a resumed training may have others.
 
     Returns:
         The state after the last step and the reported means.
 
     Raises:
-        ValueError: checkpoints are there and `resume` is not set, or there are no frames.
+        ValueError: checkpoints are there and `resume` is not set, there are no frames, or those of
+            a step do not divide by the devices.
         TrainingDiverged: the loss is not finite; the checkpoint before it is kept.
     """
     if n_frames < 1:
         raise ValueError(f"n_frames={n_frames}: expected at least one training frame")
+    mesh = frame_mesh(devices, train.batch_size)
     key = jax.random.key(seed)
     state = _init(config)(jax.random.fold_in(key, 0))
     start = 0
@@ -143,12 +153,14 @@ def fit_detector(
     else:
         clean_key = jax.random.fold_in(key, 2)
         state = with_clean_readings(config, train, state, n_frames, read, key=clean_key)
-    advance, rates = _step(config, train), params.as_arrays()
+    advance, rates = _step(config, train, mesh), params.as_arrays()
+    state = on_all(mesh, state)
     step_key = jax.random.fold_in(key, 1)
 
     def batch(step: int) -> Example:
         order = frame_order(seed, n_frames, step, train.batch_size)
-        return stack_examples([read(i) for i in order.tolist()])
+        frames: Example = in_shares(mesh, stack_examples([read(i) for i in order.tolist()]))
+        return frames
 
     done, rows = start, []
     with ThreadPoolExecutor(1) as reader, interrupt_between_steps() as check:

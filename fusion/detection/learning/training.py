@@ -12,6 +12,7 @@ from typing import Any, Literal, NamedTuple
 import jax
 import jax.numpy as jnp
 import optax
+from jax.sharding import Mesh
 from jaxtyping import Array, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
@@ -20,6 +21,7 @@ from fusion.detection.learning.examples import Example, frame_depth, make_inputs
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.pasting import paste_objects
+from fusion.detection.learning.sharding import map_frames
 from fusion.detection.network.build import init_detector
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.sensors.camera_failures import (
@@ -276,6 +278,7 @@ def train_step(
     batch: Example,
     *,
     key: PRNGKeyArray,
+    mesh: Mesh | None = None,
 ) -> tuple[DetectorState, DetectorLoss, Array]:
     r"""One step of Adam with L2, then the projection of the lattice.
 
@@ -287,6 +290,7 @@ def train_step(
         state: as from `init_training`.
         batch: examples with a leading axis.
         key: of this step; the frames' failures and flips do not depend on the model.
+        mesh: devices that share the frames (static), as from `frame_mesh`.
 
     Returns:
         the new state, the terms of the loss, and which sensors failed `[b, 2]`.
@@ -299,8 +303,8 @@ def train_step(
             jax.random.split(jax.random.fold_in(input_key, 1), len(keys)), batch, others
         )
     # One frame after the other: under vmap every kind of failure would be computed each time.
-    inputs, failed = jax.lax.map(
-        lambda a: training_inputs(config, train, a[1], key=a[0]), (keys, batch)
+    inputs, failed = map_frames(
+        lambda a: training_inputs(config, train, a[1], key=a[0]), (keys, batch), mesh
     )
     loss = dense_loss if config.is_dense else detector_loss
     gradient = jax.value_and_grad(loss, argnums=2, has_aux=True)

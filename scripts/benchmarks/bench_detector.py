@@ -7,6 +7,11 @@ for a random cloud of points. The peak is a large float32 matrix product on the 
 same run; the work of a stage is the count of XLA. On a CPU the time is CPU time, which a busy
 machine does not change much. Minutes of compiling come first. `--record` writes
 `results/bench_detector.json`. Last line: `result: ...`.
+
+    python scripts/benchmarks/bench_detector.py --size paper --stages "training step" --repeats 1
+
+times a single stage, here one step of the size that no CPU trains: seconds, memory, and a loss and
+gradients that are finite. With one repeat the first call is the one that is timed.
 """
 
 from __future__ import annotations
@@ -16,11 +21,14 @@ import functools
 import time
 from collections.abc import Callable
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal
 
 from snn_fusion_failure.commands.detector_options import ModelOption, SizeOption
 from snn_fusion_failure.records.rows import record_table, summarize
 from snn_fusion_failure.runs import enable_compilation_cache, print_result, repository, run_command
+
+Stage = Literal["maps and anchors", "forward", "suppression", "training step"]
+STAGES: tuple[Stage, ...] = ("maps and anchors", "forward", "suppression", "training step")
 
 
 @dataclasses.dataclass(frozen=True)
@@ -33,6 +41,9 @@ class Config:
     repeats: int = 5
     gemm: int = 1024
     """Side of the matrices of the peak."""
+    stages: tuple[Stage, ...] = STAGES
+    precision: Literal["float32", "bfloat16"] = "float32"
+    """Of the convolutions."""
     record: bool = False
     """Write results/bench_detector.json."""
     results: Path = repository.RESULTS
@@ -66,24 +77,56 @@ def _example(detector: Any) -> Any:
     )  # fmt: skip
 
 
-def _time(run: Callable[[], Any], repeats: int) -> float:
-    """Best of `repeats` calls [s]: CPU seconds on a CPU, wall seconds on an accelerator."""
+def _time(run: Callable[[], Any], repeats: int) -> tuple[float, Any]:
+    """Best of `repeats` calls [s], CPU seconds on a CPU, wall seconds on an accelerator; result."""
     import jax
 
     clock = time.process_time if jax.devices()[0].platform == "cpu" else time.perf_counter
-    jax.block_until_ready(run())
-    best = float("inf")
-    for _ in range(repeats):
-        start = clock()
+    if repeats > 1:
         jax.block_until_ready(run())
+    best, found = float("inf"), None
+    for _ in range(max(1, repeats)):
+        start = clock()
+        found = jax.block_until_ready(run())
         best = min(best, clock() - start)
-    return best
+    return best, found
 
 
 def _flops(compiled: Any) -> float:
     cost = compiled.cost_analysis()
     cost = cost[0] if isinstance(cost, list) else cost
     return float((cost or {}).get("flops", float("nan")))
+
+
+def _memory(compiled: Any) -> float:
+    """What a program holds at once [GB]: arguments, results and what is between."""
+    found = compiled.memory_analysis()
+    if found is None:
+        return float("nan")
+    sizes = (found.argument_size_in_bytes, found.output_size_in_bytes, found.temp_size_in_bytes)
+    return float(sum(sizes)) / 1e9
+
+
+def check_step(found: Any) -> float:
+    """Loss of a training step.
+
+    Args:
+        found: what `train_step` gives.
+
+    Raises:
+        FloatingPointError: the loss or a mean of Adam, and so a gradient, is not finite.
+    """
+    import jax
+    import jax.numpy as jnp
+
+    state, terms, _ = found
+    loss = float(terms.total)
+    for path, leaf in jax.tree_util.tree_leaves_with_path((state.opt_state, state.params)):
+        if not bool(jnp.isfinite(leaf).all()):
+            raise FloatingPointError(f"{jax.tree_util.keystr(path)} is not finite after a step")
+    if loss != loss or abs(loss) == float("inf"):
+        raise FloatingPointError(f"the loss of a step is {loss}")
+    return loss
 
 
 def main(config: Config) -> dict[str, Any]:
@@ -99,12 +142,13 @@ def main(config: Config) -> dict[str, Any]:
     from fusion.detection.presets import preset
 
     detector, training, params = preset(config.size, config.model)
+    detector = dataclasses.replace(detector, precision=config.precision)
     batch = stack_examples([_example(detector)] * config.batch_size)
     batch = jax.tree.map(jnp.asarray, batch)
     key = jax.random.key(0)
     state = jax.jit(functools.partial(init_training, config=detector))(key)
     read = jax.jit(lambda b: jax.lax.map(lambda e: make_inputs(detector, e), b))
-    inputs = read(batch)
+    inputs = read(batch) if "forward" in config.stages else None
     boxes = jax.random.uniform(key, (config.batch_size, detector.candidates, 2), maxval=40.0)
     boxes = jnp.concatenate([boxes, boxes + 4.0], axis=-1)
     scores = jax.random.uniform(key, boxes.shape[:2])
@@ -123,33 +167,42 @@ def main(config: Config) -> dict[str, Any]:
     }
     square = jnp.ones((config.gemm, config.gemm))
     product = jax.jit(lambda a: a @ a)
-    peak = 2.0 * config.gemm**3 / _time(lambda: product(square), config.repeats)
+    peak = 2.0 * config.gemm**3 / _time(lambda: product(square), max(2, config.repeats))[0]
     rows = []
 
     def add(row: str, metric: str, unit: str, value: float) -> None:
-        cell = {"row": row, "model": config.model, "metric": metric, "unit": unit}
+        # Rows of `small` have been without a size since the first record.
+        plain = {"small", "float32", "batch 1"}
+        ends = [config.size, config.precision, f"batch {config.batch_size}"]
+        name = ", ".join([row, *(end for end in ends if end not in plain)])
+        cell = {"row": name, "model": config.model, "metric": metric, "unit": unit}
         rows.append(cell | summarize([value]))
 
     add("matrix product", "gflops", "GFLOP/s", peak / 1e9)
-    for name, (function, arguments, named) in stages.items():
+    for name in config.stages:
+        function, arguments, named = stages[name]
         compiled = function.lower(*arguments, **named).compile()
-        seconds = _time(functools.partial(compiled, *arguments, **named), config.repeats)
+        seconds, found = _time(functools.partial(compiled, *arguments, **named), config.repeats)
         work = _flops(compiled)
         add(name, "frames_per_second", "1/s", config.batch_size / seconds)
         add(name, "gflop_per_frame", "GFLOP", work / config.batch_size / 1e9)
         add(name, "peak_share", "%", 100.0 * work / seconds / peak)
+        add(name, "memory", "GB", _memory(compiled))
+        if name == "training step":
+            add(name, "loss", "1", check_step(found))
         print(
             f"{name:18s} {config.batch_size / seconds:9.2f} frames/s "
             f"{work / config.batch_size / 1e9:8.2f} GFLOP/frame "
-            f"{100.0 * work / seconds / peak:5.1f} % of the matrix product",
+            f"{100.0 * work / seconds / peak:5.1f} % of the matrix product "
+            f"{_memory(compiled):6.2f} GB",
             flush=True,
         )
     if config.record:
         title = "Throughput of the detector by stage"
         path = config.results / "bench_detector.json"
-        record_table(path, "bench_detector", title, rows, preset=config.size)
+        record_table(path, "bench_detector", title, rows, preset="small, others by row")
     speed = {
-        row["row"].replace(" ", "_"): row["mean"]
+        row["row"].split(",")[0].replace(" ", "_"): row["mean"]
         for row in rows
         if row["metric"] == "frames_per_second"
     }

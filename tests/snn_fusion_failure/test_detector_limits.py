@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import weakref
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -19,7 +20,10 @@ from snn_fusion_failure.commands import detector_options as choices
 from snn_fusion_failure.commands import detector_runs as runs
 from snn_fusion_failure.commands import train_detector as command
 from snn_fusion_failure.runs import open_run
+from tests._scripts import load_script
 from tests.snn_fusion_failure.test_train_detector import write_frame
+
+bench = load_script("benchmarks/bench_detector")
 
 FRAMES = tuple(f"{i:06d}" for i in range(5))
 
@@ -120,3 +124,15 @@ def test_evaluation_holds_one_frame_at_a_time(
     assert found["frames"] == len(FRAMES) and found["3d_moderate_r40"] == 0.0
     # The one before, while the next is read.
     assert len(alive) == len(FRAMES) and max(alive) <= 1
+
+
+def test_a_benchmarked_step_must_be_finite() -> None:
+    def step(loss: float, mean: float) -> tuple[Any, ...]:
+        state = SimpleNamespace(opt_state={"mu": np.array([0.0, mean])}, params={"a": np.ones(2)})
+        return state, SimpleNamespace(total=np.float32(loss)), None
+
+    assert bench.check_step(step(2.5, 1.0)) == 2.5
+    with pytest.raises(FloatingPointError, match=r"'mu'.* is not finite after a step"):
+        bench.check_step(step(2.5, np.nan))
+    with pytest.raises(FloatingPointError, match="the loss of a step is nan"):
+        bench.check_step(step(np.nan, 1.0))

@@ -406,7 +406,7 @@ def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) ->
     slow = fit_detector(TINY, FAILING, other, 3, lambda i: example, seed=3, report_every=2)
     assert slow.history[0]["total"] != slow.history[-1]["total"] != whole.history[-1]["total"]
     # Other rates ran the same program.
-    assert fitting._step(TINY, FAILING)._cache_size() == 1  # type: ignore[attr-defined]
+    assert fitting._step(TINY, FAILING, None)._cache_size() == 1  # type: ignore[attr-defined]
     assert all(np.isfinite(list(row.values())).all() for row in whole.history)
     assert whole.history[0]["rpn_positives"] > 0 and whole.history[0]["positives"] > 0
     assert 0 < whole.history[-1]["weight_camera"] < 1

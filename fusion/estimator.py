@@ -9,12 +9,12 @@ import numpy as np
 from jaxtyping import Float
 
 from fusion import sensor_network
-from fusion._checks import check_count, check_number
-from fusion.config import HyperParams, ModelConfig, TrainConfig
+from fusion._checks import check_choice, check_count, check_number
+from fusion.config import MODELS, HyperParams, ModelConfig, TrainConfig
 from fusion.data import from_arrays
 from fusion.data.csv_folder import assemble
 from fusion.encoders import EncoderConfig, reading_levels, readings_recur
-from fusion.failures import no_failure, random_failing
+from fusion.failures import Protocol, no_failure, random_failing
 from fusion.fitted import FittedARGate, Prediction, finish
 from fusion.fitted_sensors import FittedSensors, SensorPrediction, finish_sensors
 from fusion.loop import Corruption, fit
@@ -35,7 +35,6 @@ class _Sensors(BaseEstimator):
     def __sklearn_tags__(self) -> Any:
         tags = super().__sklearn_tags__()
         tags.input_tags.three_d_array = True
-        tags.input_tags.allow_nan = True
         return tags
 
     def _windows(self, X: Any, *, missing: bool, fitting: bool, y: Any = None) -> Any:
@@ -59,15 +58,24 @@ class _Sensors(BaseEstimator):
         return (windows, y) if fitting else windows
 
 
+def _protocol(channels: tuple[str, ...], n_clean: int | None) -> Protocol:
+    """Which sensors fail in training; a single one has no other to stand in for it."""
+    if len(channels) == 1 and n_clean is None:
+        return no_failure(channels)
+    return random_failing(channels, len(channels) // 2 if n_clean is None else n_clean)
+
+
 class ARGateClassifier(ClassifierMixin, _Sensors):
     """Gated sensor fusion that is trained on failing sensors, with scikit-learn's interface.
 
     `X` is `[N, K, T]`, windows of T samples of K sensors, or `[N, K]`, one reading of each sensor
-    (a column is a sensor). In `predict` NaN means that a sensor sent nothing.
+    (a column is a sensor). In `predict` NaN means that a sensor sent nothing, so scikit-learn's
+    `check_estimators_nan_inf`, which wants it refused there, does not apply.
 
     Args:
-        model: a name in `fusion.MODELS` other than `oracle`.
-        n_clean: sensors that keep working in two thirds of the training rows; half when None.
+        model: a name in `fusion.MODELS` other than `oracle`, which would have to be told failures.
+        n_clean: sensors that keep working in two thirds of the training rows; half when None. A
+            single sensor never fails in training: no other could stand in for it.
         kind: how the others fail, see `fusion.failure_kinds.FAILURE_KINDS`.
         epochs, batch_size, learning_rate: of the training.
         features, gate_width, head_width: sizes of the network.
@@ -114,6 +122,8 @@ class ARGateClassifier(ClassifierMixin, _Sensors):
         """
         check_count("seed", self.seed, 0)
         check_number("learning_rate", self.learning_rate, 0.0, above=True, fix="5e-3 is usual")
+        # An oracle would train on masks of failures that nobody gives it in `predict`.
+        check_choice("model", self.model, [name for name in MODELS if name != "oracle"])
         windows, y = self._windows(X, missing=False, fitting=True, y=y)
         check_classification_targets(y)
         if np.ndim(y) == 2:
@@ -142,7 +152,7 @@ class ARGateClassifier(ClassifierMixin, _Sensors):
             head_widths=(self.head_width,),
             dropout=0.1,
         )
-        protocol = random_failing(data.channels, k // 2 if self.n_clean is None else self.n_clean)
+        protocol = _protocol(data.channels, self.n_clean)
         noise = Corruption(protocol, protocol, self.kind)
         batch = min(self.batch_size, len(data.train_y))
         train = TrainConfig(epochs=self.epochs, batch_size=batch)
@@ -179,7 +189,8 @@ class ARGateRegressor(MultiOutputMixin, RegressorMixin, _Sensors):
 
     Args:
         model: one of `fusion.sensor_network.RECIPES`.
-        n_clean: sensors that keep working in two thirds of the training rows; half when None.
+        n_clean: sensors that keep working in two thirds of the training rows; half when None. A
+            single sensor never fails in training: no other could stand in for it.
         kind: how the others fail, see `fusion.failure_kinds.FAILURE_KINDS`.
         epochs, batch_size, learning_rate: of the training.
         features, width: sizes of the network.
@@ -239,13 +250,16 @@ class ARGateRegressor(MultiOutputMixin, RegressorMixin, _Sensors):
             batch_size=self.batch_size,
             learning_rate=self.learning_rate,
         )
-        n_clean = k // 2 if self.n_clean is None else self.n_clean
-        # A single sensor has no other to stand in for it.
-        protocol = no_failure(sensors) if k == 1 else random_failing(sensors, n_clean)
+        protocol = _protocol(sensors, self.n_clean)
         key = jax.random.key(self.seed)
         trained = sensor_network.fit(config, data, protocol, self.kind, key=key)
         self.fitted_ = finish_sensors(config, trained.params, data)
         return self
+
+    def __sklearn_tags__(self) -> Any:
+        tags = super().__sklearn_tags__()
+        tags.input_tags.allow_nan = True
+        return tags
 
     @staticmethod
     def _readings(windows: np.ndarray) -> list[np.ndarray]:

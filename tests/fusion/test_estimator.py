@@ -13,6 +13,7 @@ sklearn = pytest.importorskip("sklearn")
 from sklearn.base import clone  # noqa: E402
 from sklearn.exceptions import NotFittedError  # noqa: E402
 from sklearn.model_selection import cross_val_score  # noqa: E402
+from sklearn.utils import get_tags  # noqa: E402
 from sklearn.utils.estimator_checks import estimator_checks_generator  # noqa: E402
 
 from fusion.estimator import ARGateClassifier, ARGateRegressor  # noqa: E402
@@ -96,6 +97,20 @@ def test_checks_of_scikit_learn_pass(estimator: Any) -> None:
             check(one)
             ran.append(name)
     assert set(ran) == set(QUICK)
+
+
+def test_an_oracle_is_refused_and_training_rows_of_a_classifier_hold_no_nan() -> None:
+    with pytest.raises(ValueError, match="model='oracle': expected one of 'baseline'"):
+        clone(SMALL).set_params(model="oracle").fit(X, Y)
+    # Pipelines ask the tags whether training takes NaN, which means an absent sensor in predict.
+    assert not get_tags(SMALL).input_tags.allow_nan
+    assert get_tags(ARGateRegressor()).input_tags.allow_nan
+
+
+@pytest.mark.slow
+def test_a_single_sensor_is_fitted() -> None:
+    alone = clone(SMALL).set_params(epochs=1).fit(X[:, :1], Y)
+    assert alone.predict(X[:, :1]).shape == Y.shape
 
 
 @pytest.mark.parametrize("kind", [ARGateClassifier, ARGateRegressor])

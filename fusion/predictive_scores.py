@@ -169,3 +169,63 @@ def fit_temperature(logits: ArrayLike, labels: ArrayLike) -> float:
 
     found = minimize_scalar(loss, bounds=(np.log(0.05), np.log(20.0)), method="bounded")
     return float(np.exp(found.x))
+
+
+def outcome_brier(
+    probabilities: ArrayLike,
+    outcomes: ArrayLike,
+    weights: ArrayLike | None = None,
+) -> float:
+    r"""Mean squared distance of the told probabilities of an event to what happened, in [0, 1].
+
+    .. math:: B = \sum_i w_i (p_i - y_i)^2 / \sum_i w_i
+
+    Symbols: :math:`p` is `probabilities`, :math:`y` is `outcomes`, :math:`w` is `weights` (alike
+    when left out).
+
+    Source: Brier (1950).
+
+    Example:
+        >>> outcome_brier(np.array([0.5, 1.0]), np.array([True, True]))
+        0.125
+    """
+    p, y, w = _told(probabilities, outcomes, weights)
+    return float(np.sum(w * (p - y) ** 2))
+
+
+def outcome_calibration_error(
+    probabilities: ArrayLike,
+    outcomes: ArrayLike,
+    weights: ArrayLike | None = None,
+    n_bins: int = 10,
+) -> float:
+    r"""Expected calibration error: how far told probabilities lie from shares of what happened.
+
+    .. math:: E = \sum_b W_b \, |\bar p_b - \bar y_b|
+
+    over `n_bins` bins of equal width, with :math:`W_b` the share of a bin and bars means in it.
+
+    Source: Naeini, Cooper, Hauskrecht (2015).
+
+    Example:
+        >>> outcome_calibration_error(np.array([0.9, 0.9]), np.array([True, False]))
+        0.4
+    """
+    p, y, w = _told(probabilities, outcomes, weights)
+    place = np.minimum((p * n_bins).astype(np.int64), n_bins - 1)
+    gaps = np.bincount(place, weights=w * (p - y), minlength=n_bins)
+    return float(np.abs(gaps).sum())
+
+
+def _told(
+    probabilities: ArrayLike, outcomes: ArrayLike, weights: ArrayLike | None
+) -> tuple[np.ndarray, np.ndarray, np.ndarray]:
+    """All three in float64, the weights summing to one."""
+    p, y = np.asarray(probabilities, np.float64), np.asarray(outcomes, np.float64)
+    w = np.ones_like(p) if weights is None else np.asarray(weights, np.float64)
+    if not p.size or not ((p >= 0) & (p <= 1)).all():
+        raise ValueError(
+            "probabilities=array: expected numbers from 0 to 1, at least one; leave out what is "
+            "not told"
+        )
+    return p, y, w / w.sum()

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 import dataclasses
+import itertools
 from typing import Literal, get_args
+
+import numpy as np
+from jaxtyping import Float
 
 from fusion.detection.geometry.anchors import AnchorConfig
 from fusion.detection.geometry.bev import BevConfig
+from fusion.detection.sensors.hdl64 import ELEVATIONS
 from fusion.gating import Normalizer
 from fusion.losses import LossConfig
 from fusion.targets import TargetConfig
@@ -86,6 +91,8 @@ class DetectorConfig:
             leaves a detector of the camera alone.
         bev, anchors: area and anchor grid.
         image_size: rows and columns that images are resized to.
+        beams: elevations of the lidar's beams from the top one down [degree], which `beam_loss`
+            loses; None for those of the HDL-64E, empty where they are not known.
         max_points, max_objects: fixed sizes of scan and labels.
         widths: channels of the encoder's four levels; layers: convolutions on each.
         precision: of the convolutions, `float32` or `bfloat16`, for accelerators; parameters,
@@ -129,6 +136,7 @@ class DetectorConfig:
     bev: BevConfig = dataclasses.field(default_factory=BevConfig)
     anchors: AnchorConfig = dataclasses.field(default_factory=lambda: AnchorConfig(CAR_SIZES))
     image_size: tuple[int, int] = (360, 1200)
+    beams: tuple[float, ...] | None = None
     max_points: int = 32_768
     max_objects: int = 32
     widths: tuple[int, ...] = (32, 64, 128, 256)
@@ -176,6 +184,14 @@ class DetectorConfig:
             raise ValueError(f"target={self.target!r}: expected one of {', '.join(TARGETS)}")
         if self.norm not in ("batch", "group"):
             raise ValueError(f"norm={self.norm!r}: expected 'batch' or 'group'")
+        if self.beams and not (
+            all(a > b for a, b in itertools.pairwise(self.beams))
+            and 90 > self.beams[0] > self.beams[-1] > -90
+        ):
+            raise ValueError(
+                f"beams={self.beams}: expected elevations [degree] from the top beam down, each "
+                "once; give at least two"
+            )
         if self.precision not in get_args(Precision):
             raise ValueError(f"precision={self.precision!r}: expected 'float32' or 'bfloat16'")
         if self.final_overlap not in get_args(Overlap):
@@ -236,3 +252,8 @@ class DetectorConfig:
     def is_dense(self) -> bool:
         """Is it the one-stage detector?"""
         return self.model.startswith("dense")
+
+    @property
+    def beam_elevations(self) -> Float[np.ndarray, " b"]:
+        """Elevations of the lidar's beams from the top one down [rad]."""
+        return ELEVATIONS if self.beams is None else np.radians(self.beams).astype(np.float32)

@@ -1,9 +1,12 @@
-"""`train_detector.py drive`: a moving picture of a drive on which a sensor dies."""
+"""`train_detector.py drive`: a picture of a drive on which a sensor dies."""
 
 from __future__ import annotations
 
+import io
+from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.commands.detector_calibration import read_calibration
 from snn_fusion_failure.commands.detector_options import Drive
 from snn_fusion_failure.commands.detector_runs import (
     build,
@@ -27,10 +30,14 @@ def severities(n: int) -> list[float]:
 
 def drive(config: Drive) -> dict[str, Any]:
     """Simulate the drive, detect in every frame, write the picture; returns means."""
+    run = config.run or run_folder(config)
+    out = config.out or run / f"drive_{config.failure}.gif"
+    if out.suffix not in (".gif", ".png"):
+        raise ValueError(f"out={out}: expected a .gif, which moves, or a .png; rename it")
     enable_compilation_cache()
     import numpy as np
 
-    from fusion.detection.drive_plots import Moment, plot_drive
+    from fusion.detection.drive_plots import Moment
     from fusion.detection.learning.cache import open_cache
     from fusion.detection.learning.examples import MEAN_RGB, make_example
     from fusion.detection.learning.fitting import failed_inputs, run_detector
@@ -42,10 +49,10 @@ def drive(config: Drive) -> dict[str, Any]:
 
     if config.failure not in FAILURES:
         raise ValueError(f"failure={config.failure!r}: expected one of {', '.join(FAILURES)}")
-    run = config.run or run_folder(config)
     trained = run_config(run, config)
     setup = build(trained, open_cache(cache_folder(config)))
     state = load_run(run, setup)
+    told = read_calibration(run, state)
     sensors = SIZES[config.size]
     calibration = nominal_calibration(sensors.scale)
     moments = []
@@ -63,7 +70,7 @@ def drive(config: Drive) -> dict[str, Any]:
                 "seed": config.seed,
             }
             inputs = failed_inputs(setup.config, example, **options)
-            (found,) = run_detector(setup.config, state, [example], **options)
+            (found,) = run_detector(setup.config, state, [example], calibration=told, **options)
             sure = found.mask & (found.scores >= config.threshold)
             moments.append(
                 Moment(
@@ -77,10 +84,8 @@ def drive(config: Drive) -> dict[str, Any]:
                 )
             )
             bar.update(task, advance=1)
-    out = config.out or run / f"drive_{config.failure}.gif"
-    out.parent.mkdir(parents=True, exist_ok=True)
-    moving = plot_drive(moments, setup.config.bev, config.failure)
-    moving.save(out, writer="pillow", fps=config.fps, dpi=config.dpi)
+    threshold = None if told is None else np.asarray(told.threshold)
+    _save(out, config, moments, setup.config.bev, threshold)
     sensor = "lidar" if config.failure.startswith("lidar") else "camera"
     k = ("camera", "lidar").index(sensor)
     return {
@@ -88,5 +93,26 @@ def drive(config: Drive) -> dict[str, Any]:
         "frames": len(moments),
         f"weight_{sensor}_first": float(moments[0].weights[k]),
         f"weight_{sensor}_last": float(moments[-1].weights[k]),
+        f"failed_{sensor}_first": float(moments[0].failed[k]),
+        f"failed_{sensor}_last": float(moments[-1].failed[k]),
         "detections": sum(len(m.found) for m in moments),
+        "kilobytes": out.stat().st_size / 1e3,
     }
+
+
+def _save(out: Path, config: Drive, moments: list[Any], area: Any, threshold: Any) -> None:
+    """Write the drive as a moving picture or as some of its moments."""
+    from PIL import Image
+
+    from fusion.detection.drive_plots import plot_drive, plot_moments
+
+    out.parent.mkdir(parents=True, exist_ok=True)
+    if out.suffix == ".gif":
+        moving = plot_drive(moments, area, config.failure, threshold)
+        moving.save(out, writer="pillow", fps=config.fps, dpi=config.dpi)
+        return
+    drawing = io.BytesIO()
+    plot_moments(moments, area, config.failure, threshold).savefig(drawing, dpi=config.dpi)
+    with Image.open(drawing) as picture:
+        # A palette makes the file a third as large.
+        picture.convert("RGB").quantize(128).save(out, optimize=True)

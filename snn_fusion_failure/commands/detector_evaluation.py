@@ -8,6 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.commands.detector_calibration import read_calibration
 from snn_fusion_failure.commands.detector_options import Eval
 from snn_fusion_failure.commands.detector_runs import (
     build,
@@ -43,6 +44,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
     setup = build(trained, cache)
     check_settings(folder, setup)
     state = load_run(folder, setup)
+    calibration = read_calibration(folder, state)
     names = cache.names(config.split)
     cameras: dict[str, Camera] = {}
 
@@ -70,6 +72,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
             failure=config.failure,
             severity=config.severity,
             seed=config.seed,
+            calibration=calibration,
             on_frame=show,
         )
     target = setup.config.target
@@ -91,6 +94,11 @@ def evaluate(config: Eval) -> dict[str, Any]:
         # The first frame waits for the compiler.
         "seconds_per_frame": (clock[-1] - clock[0]) / (len(clock) - 1) if clock[1:] else None,
     }
+    if calibration is not None:
+        called = (failed > np.asarray(calibration.threshold)[None]).mean(axis=0)
+        summary |= {
+            f"called_{sensor}": float(share) for sensor, share in zip(SENSORS, called, strict=True)
+        }
     if config.split != TESTING:
         widths = [float(camera.image_size[1]) for camera in cameras.values()]
         summary |= _score(config, target, names, objects, widths, out)
@@ -113,7 +121,7 @@ def evaluate(config: Eval) -> dict[str, Any]:
         plot_image(frame, best).savefig(out / f"{names[i]}_image.png", dpi=120)
     np.savetxt(out / "fusion_weights.txt", weights, fmt="%.6f", header="camera lidar")
     if np.isfinite(failed).all():
-        np.savetxt(out / "failed.txt", failed, fmt="%.6f", header="camera lidar")
+        np.savetxt(out / "failed.txt", failed, fmt="%.9g", header="camera lidar")
     write_json(out / "result.json", summary | {"provenance": provenance()})
     print(f"{len(names)} frames, result files and pictures in {out}")
     return summary

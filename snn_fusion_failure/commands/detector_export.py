@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from typing import Any
 
+from snn_fusion_failure.commands.detector_calibration import read_calibration
 from snn_fusion_failure.commands.detector_options import Export
 from snn_fusion_failure.commands.detector_runs import (
     build,
@@ -21,6 +22,7 @@ def export(config: Export) -> dict[str, Any]:
 
     from fusion.detection.learning.cache import open_cache, read_example
     from fusion.detection.learning.stablehlo import write_detector
+    from fusion.detection.network.detector import SENSORS
 
     run = config.run or run_folder(config)
     cache = open_cache(cache_folder(config))
@@ -34,14 +36,19 @@ def export(config: Export) -> dict[str, Any]:
         rows, columns = np.asarray(first.image_size).astype(int).tolist()
         size = (rows, columns)
     out = config.out or run / "detector.stablehlo"
+    state = load_run(run, setup)
+    calibration = read_calibration(run, state)
     write_detector(
         setup.config,
-        load_run(run, setup),
+        state,
         out,
         image_size=size,
         n_points=config.points,
         platforms=config.platforms,
+        calibration=calibration,
     )
+    # The program tells probabilities; from which one on to call a failure is its caller's to know.
+    calls = {} if calibration is None else dict(zip(SENSORS, calibration.threshold, strict=True))
     return {
         "program": str(out),
         "model": trained.model,
@@ -49,4 +56,5 @@ def export(config: Export) -> dict[str, Any]:
         "columns": size[1],
         "points": config.points,
         "megabytes": out.stat().st_size / 1e6,
+        **{f"threshold_{sensor}": value for sensor, value in calls.items()},
     }

@@ -44,6 +44,10 @@ class Prepare:
     """Of the camera above the road [m], where frames have no plane file."""
     camera_tilt: float = 8.0
     """Largest angle of the camera to the road [degree], likewise."""
+    beams: int | None = None
+    """Of the lidar, for `lidar_beam_loss`; told from the scans when left out."""
+    beam_elevations: tuple[float, ...] = ()
+    """Elevations of its beams [degree], where the scans do not show them."""
 
 
 @dataclasses.dataclass(frozen=True)
@@ -76,20 +80,27 @@ class Train:
 
 
 @dataclasses.dataclass(frozen=True)
-class Eval:
-    """Evaluate a trained detector, all sensors working or one failed."""
+class OfRun:
+    """What names a trained run."""
 
     data: Path
+    """KITTI folder of the run."""
     model: ModelOption = "avod_argate"
     size: SizeOption = "small"
     cache: Path | None = None
-    split: str = "val"
-    """List in ImageSets, or `testing`: result files only, since there are no labels."""
     seed: int = 0
     failures: bool = False
     """The run that was trained with failures (names the folder)."""
     run: Path | None = None
     """Run folder; named as in `train` when left out."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Eval(OfRun):
+    """Evaluate a trained detector, all sensors working or one failed."""
+
+    split: str = "val"
+    """List in ImageSets, or `testing`: result files only, since there are no labels."""
     failure: str | None = None
     """Failure in every frame, e.g. camera_blackout, lidar_loss, time_lag."""
     severity: float = 1.0
@@ -105,19 +116,10 @@ class Eval:
 
 
 @dataclasses.dataclass(frozen=True)
-class Drive:
-    """A moving picture of a simulated drive on which a sensor dies."""
+class Drive(OfRun):
+    """A picture of a simulated drive on which a sensor dies."""
 
-    data: Path
-    """Of the run; the drive itself is simulated."""
     model: ModelOption = "dense_argate"
-    size: SizeOption = "small"
-    cache: Path | None = None
-    seed: int = 0
-    failures: bool = False
-    """The run that was trained with failures (names the folder)."""
-    run: Path | None = None
-    """Run folder; named as in `train` when left out."""
     failure: str = "camera_fog"
     """Its severity rises from 0 to 1 in the middle third of the drive."""
     frames: int = 45
@@ -130,23 +132,15 @@ class Drive:
     fps: int = 10
     dpi: int = 80
     out: Path | None = None
-    """The picture (.gif); RUN/drive_FAILURE.gif when left out."""
+    """The picture, moving (.gif) or four moments of it (.png); RUN/drive_FAILURE.gif when left
+    out."""
 
 
 @dataclasses.dataclass(frozen=True)
-class Export:
+class Export(OfRun):
     """A trained run as one file that needs jax and not this package."""
 
-    data: Path
-    """Of the run."""
     model: ModelOption = "dense_argate"
-    size: SizeOption = "small"
-    cache: Path | None = None
-    seed: int = 0
-    failures: bool = False
-    """The run that was trained with failures (names the folder)."""
-    run: Path | None = None
-    """Run folder; named as in `train` when left out."""
     image_size: tuple[int, int] | None = None
     """Rows and columns of the images that it will get; those of the run's first frame when left
     out."""
@@ -159,19 +153,10 @@ class Export:
 
 
 @dataclasses.dataclass(frozen=True)
-class Robustness:
+class Robustness(OfRun):
     """Average precision of a trained detector by failure and severity, and on corrupted folders."""
 
-    data: Path
-    model: ModelOption = "avod_argate"
-    size: SizeOption = "small"
-    cache: Path | None = None
     split: str = "val"
-    seed: int = 0
-    failures: bool = False
-    """The run that was trained with failures (names the folder)."""
-    run: Path | None = None
-    """Run folder; named as in `train` when left out."""
     kinds: tuple[str, ...] | None = None
     """Failures to try; all when left out, none with `--kinds` alone."""
     levels: tuple[int, ...] = (1, 2, 3, 4, 5)
@@ -185,3 +170,13 @@ class Robustness:
     out: Path | None = None
     """Folder of results; RUN/robustness_SPLIT when left out. What is there is not done again, and
     refused when it was measured with other options or another training."""
+
+
+@dataclasses.dataclass(frozen=True)
+class Calibrate(OfRun):
+    """Calibrate the failures that a trained detector tells, on frames its training did not see."""
+
+    model: ModelOption = "dense_argate"
+    split: str = "val"
+    false_alarm_rate: float = 0.01
+    """Share of frames with working sensors in which a sensor is called failed."""

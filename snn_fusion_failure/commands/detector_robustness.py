@@ -17,9 +17,16 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
+from snn_fusion_failure.commands.detector_calibration import as_calibration, held_calibration
 from snn_fusion_failure.commands.detector_evaluation import evaluate
 from snn_fusion_failure.commands.detector_options import Eval, Robustness
 from snn_fusion_failure.commands.detector_runs import cache_folder, run_config, run_folder
+from snn_fusion_failure.commands.detector_told import (
+    print_told,
+    read_told,
+    score_told,
+    told_fields,
+)
 from snn_fusion_failure.runs import provenance, to_jsonable, write_json
 
 METRIC = "3d_moderate_r40"
@@ -110,10 +117,12 @@ def check_results(out: Path, run: Path, options: Eval) -> None:
     given = {
         "data": options.data.resolve(), "split": options.split, "seed": options.seed,
         "overlap": options.overlap, "trained": trained, "trained_steps": max(steps, default=0),
+        "calibration": held_calibration(run),
     }  # fmt: skip
     now, path = to_jsonable(given), out / "measured.json"
     if path.exists():
-        before = json.loads(path.read_text(encoding="utf-8"))
+        # Results of before there were calibrations have none.
+        before = {"calibration": None} | json.loads(path.read_text(encoding="utf-8"))
         for name, value in now.items():
             if before.get(name, value) != value:
                 raise ValueError(
@@ -172,5 +181,18 @@ def robustness(config: Robustness) -> dict[str, Any]:
     for kind, by_level in cells.items():
         print(f"{kind:<28}" + "".join(f"{value:8.2f}" for value in by_level.values()))
     found = {"model": model, "clean": clean} | summarize_cells(clean, cells, held)
-    write_json(out / "robustness.json", found | {"cells": cells, "provenance": provenance()})
+    record: dict[str, Any] = {"cells": cells, "provenance": provenance()}
+    told = read_told(out, kinds, config.levels)
+    if told is not None:
+        calibration = held_calibration(run)
+        record["told"] = scored = score_told(told, as_calibration(calibration))
+        print_told(scored, config.levels)
+        if calibration is None:
+            print("probabilities as the network tells them: run `calibrate` for calibrated ones")
+        elif calibration["split"] == config.split:
+            print(
+                f"calibrated on these frames: another list than {config.split!r} is a fairer test"
+            )
+        found |= told_fields(scored)
+    write_json(out / "robustness.json", found | record)
     return found

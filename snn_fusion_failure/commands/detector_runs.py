@@ -8,14 +8,7 @@ from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
-from snn_fusion_failure.commands.detector_options import (
-    Drive,
-    Eval,
-    Export,
-    Prepare,
-    Robustness,
-    Train,
-)
+from snn_fusion_failure.commands.detector_options import OfRun, Prepare, Train
 from snn_fusion_failure.runs import apply_changes, to_jsonable
 
 # Options that do not change the numbers of a run.
@@ -29,12 +22,12 @@ _OLD_OPTIONS = {
 }  # fmt: skip
 
 
-def cache_folder(config: Prepare | Train | Eval | Drive | Export | Robustness) -> Path:
+def cache_folder(config: Prepare | Train | OfRun) -> Path:
     """Where the examples of a data folder and size are."""
     return config.cache or config.data / f"cache_{config.size}"
 
 
-def run_folder(config: Train | Eval | Drive | Export | Robustness) -> Path:
+def run_folder(config: Train | OfRun) -> Path:
     """Where a training keeps its files."""
     failing = "_failures" if config.failures else ""
     name = f"{config.data.resolve().name}_{config.model}_{config.size}{failing}_s{config.seed}"
@@ -82,7 +75,7 @@ def load_run(folder: Path, setup: Any) -> Any:
     return state
 
 
-def run_config(folder: Path, config: Eval | Drive | Export) -> Train:
+def run_config(folder: Path, config: OfRun) -> Train:
     """The command line that a run was trained with.
 
     Raises:

@@ -13,14 +13,15 @@
 ROOT is a folder in the layout of KITTI (`training/{image_2,velodyne,calib,label_2,planes}`,
 `ImageSets/{train,val}.txt`), real or from `scripts/simulate_kitti.py`. `prepare` checks them, fits
 missing ground planes, clusters the anchor sizes and writes examples of fixed size; `train`
-writes checkpoints and can `--resume`; `eval` writes result files in KITTI's format, precision
-curves, pictures from above and of the image, and ends with a line `result: ...`. `--split testing`
-takes the frames of ROOT/testing (no labels, hence result files and no score). `robustness` repeats
-`eval` for every failure at severities 1 to 5 and for corrupted copies of the frames
-(`--corrupted`), and prints a table with the mean relative precision (mRA). `drive` simulates a
-drive on which a sensor dies and draws what it reads, what is found and what the gate says. `export`
-writes the trained detector, resizing and maps included, as a StableHLO program that jax runs
-without this package. `small` is for two CPU cores (minutes), `paper` for an accelerator (see
+writes checkpoints, can `--resume`, and ends with `calibrate`, which fits the told probabilities of
+failure, and when to call one, to the validation frames; `eval` writes result files in KITTI's
+format, precision curves, pictures from above and of the image, and ends with a line `result: ...`.
+`--split testing` takes the frames of ROOT/testing (no labels, hence result files and no score).
+`robustness` repeats `eval` for every failure at severities 1 to 5 and for corrupted copies of the
+frames (`--corrupted`), and prints a table with the mean relative precision (mRA). `drive` simulates
+a drive on which a sensor dies and draws what it reads, what is found and what the gate says.
+`export` writes the trained detector, resizing and maps included, as a StableHLO program that jax
+runs without this package. `small` is for two CPU cores (minutes), `paper` for an accelerator (see
 docs/kitti.md).
 """
 
@@ -33,10 +34,12 @@ from typing import Annotated, Any
 
 import tyro
 
+from snn_fusion_failure.commands.detector_calibration import FILE, calibrate, calibrate_if_possible
 from snn_fusion_failure.commands.detector_drive import drive
 from snn_fusion_failure.commands.detector_evaluation import evaluate
 from snn_fusion_failure.commands.detector_export import export
 from snn_fusion_failure.commands.detector_options import (
+    Calibrate,
     Drive,
     Eval,
     Export,
@@ -44,6 +47,7 @@ from snn_fusion_failure.commands.detector_options import (
     Robustness,
     Train,
 )
+from snn_fusion_failure.commands.detector_preparation import prepare
 from snn_fusion_failure.commands.detector_robustness import robustness
 from snn_fusion_failure.commands.detector_runs import (
     NOT_SETTINGS,
@@ -62,37 +66,6 @@ from snn_fusion_failure.runs import (
     write_json,
 )
 from snn_fusion_failure.runs.command import run_command
-
-
-def prepare(config: Prepare) -> dict[str, Any]:
-    """Write the cache; returns its counts."""
-    from fusion.detection.geometry.planes import PlaneConfig
-    from fusion.detection.learning.cache import TESTING, open_cache, prepare_cache
-
-    with progress() as bar:
-        task = bar.add_task("prepare", total=None, status="")
-        cache = prepare_cache(
-            config.data,
-            cache_folder(config),
-            config.size,
-            splits=config.splits,
-            add=config.add or config.splits[:1] == (TESTING,),
-            like=open_cache(config.like) if config.like else None,
-            copies=config.copies,
-            any_size=config.any_size,
-            target=config.target,
-            skip_bad=config.skip_bad,
-            ground=PlaneConfig(camera_height=config.camera_height, max_tilt=config.camera_tilt),
-            on_frame=lambda done, n, name: bar.update(task, total=n, completed=done, status=name),
-        )
-    for name, reason in cache.counts["skipped"].items():
-        print(f"skipped {name}: {reason}")
-    if cache.counts["missing"]:
-        print(f"{cache.counts['missing']} listed frames have no image and were left out")
-    sizes = "; ".join(f"{a:.2f} x {b:.2f} x {c:.2f}" for a, b, c in cache.sizes)
-    print(f"anchor sizes (length x width x height) [m]: {sizes}")
-    fields = {f"frames_{split}": len(names) for split, names in cache.splits.items()}
-    return fields | {"skipped": 0} | cache.counts | {"skipped": len(cache.counts["skipped"])}
 
 
 def train(config: Train) -> dict[str, Any]:
@@ -116,7 +89,7 @@ def train(config: Train) -> dict[str, Any]:
     checkpoints = out / "checkpoints"
     if config.overwrite and checkpoints.exists():
         shutil.rmtree(checkpoints)
-    for stale in out.glob("clean_weights_*.npy"):
+    for stale in (*out.glob("clean_weights_*.npy"), *out.glob(FILE)):
         stale.unlink()
     held: dict[int, Any] = {}
 
@@ -162,13 +135,17 @@ def train(config: Train) -> dict[str, Any]:
     }
     extra = {"settings": resolved(setup), "provenance": provenance()}
     write_json(out / "result.json", result | extra)
+    calibrate_if_possible(out, setup, fitted.state, cache)
     return result
 
 
-def main(config: Prepare | Train | Eval | Drive | Export | Robustness) -> dict[str, Any]:
-    """Run one of the six commands."""
+def main(
+    config: Prepare | Train | Calibrate | Eval | Drive | Export | Robustness,
+) -> dict[str, Any]:
+    """Run one of the seven commands."""
     run: dict[type, Any] = {
-        Prepare: prepare, Train: train, Drive: drive, Export: export, Robustness: robustness
+        Prepare: prepare, Train: train, Calibrate: calibrate, Drive: drive, Export: export,
+        Robustness: robustness,
     }  # fmt: skip
     if not isinstance(config, Eval):
         shown = result = run[type(config)](config)
@@ -177,7 +154,7 @@ def main(config: Prepare | Train | Eval | Drive | Export | Robustness) -> dict[s
         names = (
             "model", "split", "frames", "failure", "3d_moderate_r40", "bev_moderate_r40",
             "3d_moderate_r40_iou50", "3d_moderate_r11", "cap_moderate_r40", "detections",
-            "weight_camera", "failed_camera", "failed_lidar",
+            "weight_camera", "failed_camera", "failed_lidar", "called_camera", "called_lidar",
             "weight_auroc", "seconds_per_frame",
         )  # fmt: skip
         shown = {k: result[k] for k in names if result.get(k) is not None}
@@ -188,6 +165,7 @@ def main(config: Prepare | Train | Eval | Drive | Export | Robustness) -> dict[s
 Command = (
     Annotated[Prepare, tyro.conf.subcommand("prepare")]
     | Annotated[Train, tyro.conf.subcommand("train")]
+    | Annotated[Calibrate, tyro.conf.subcommand("calibrate")]
     | Annotated[Eval, tyro.conf.subcommand("eval")]
     | Annotated[Drive, tyro.conf.subcommand("drive")]
     | Annotated[Export, tyro.conf.subcommand("export")]

@@ -104,6 +104,10 @@ RULES = (
     ),
     Rule("train_detector.py prepare", "--size tiny --any-size"),
     Rule("train_detector.py train", "--size tiny --steps 1 --overwrite"),
+    Rule(
+        "train_detector.py calibrate",
+        "--size tiny --false-alarm-rate 0.4",
+    ),
     Rule("train_detector.py eval", "--size tiny --pictures 1"),
     Rule("train_detector.py drive", "--size tiny --frames 2"),
     Rule("train_detector.py robustness", "--size tiny --kinds camera_blackout --levels 5"),

@@ -37,6 +37,12 @@ from fusion.detection.learning.examples import (
     make_inputs,
     stack_examples,
 )
+from fusion.detection.learning.failure_calibration import (
+    CalibrationReport,
+    calibrate_log_odds,
+    calibrate_told_failures,
+    read_log_odds,
+)
 from fusion.detection.learning.fitting import (
     DetectorFit,
     failed_inputs,
@@ -55,6 +61,7 @@ from fusion.detection.learning.gate_objective import (
 )
 from fusion.detection.learning.inference import detect, to_objects
 from fusion.detection.learning.interrupts import interrupt_between_steps
+from fusion.detection.learning.label_sizes import anchor_sizes
 from fusion.detection.learning.objective import DetectorLoss, detector_loss
 from fusion.detection.learning.params import DetectorParams
 from fusion.detection.learning.pasting import paste_objects
@@ -86,6 +93,7 @@ __all__ = [
     "TESTING",
     "Assignment",
     "Cache",
+    "CalibrationReport",
     "Camera",
     "Checkpoints",
     "DetectorFit",
@@ -98,10 +106,13 @@ __all__ = [
     "PathLosses",
     "Sample",
     "StageLoss",
+    "anchor_sizes",
     "assign",
     "average_cells",
     "balanced_class_loss",
     "box_overlaps",
+    "calibrate_log_odds",
+    "calibrate_told_failures",
     "camera_frame",
     "class_loss",
     "class_losses",
@@ -140,6 +151,7 @@ __all__ = [
     "precision_fields",
     "prepare_cache",
     "read_example",
+    "read_log_odds",
     "regression_loss",
     "restore_detector",
     "run_detector",

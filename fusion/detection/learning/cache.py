@@ -16,13 +16,15 @@ from typing import Any, cast
 
 import numpy as np
 
-from fusion.detection.config import TARGET_SIZES, TARGETS, DetectorConfig, Target
-from fusion.detection.geometry.anchors import cluster_sizes
+from fusion.detection.config import TARGETS, DetectorConfig, Target
 from fusion.detection.geometry.planes import PlaneConfig
-from fusion.detection.kitti.files import frame_names, read_frame, read_labels, read_split
+from fusion.detection.kitti.files import frame_names, read_frame, read_split
 from fusion.detection.learning.examples import MAX_REGIONS, Example, make_example
+from fusion.detection.learning.label_sizes import anchor_sizes
 from fusion.detection.presets import preset
+from fusion.detection.sensors.beams import beams_of_scans, elevations_of
 
+_SCANS = 10  # of which the beams are told
 TESTING = "testing"
 """The split of all frames in `ROOT/testing`, which have no labels; not a list of `ImageSets`."""
 
@@ -48,6 +50,7 @@ class Cache:
         sizes: anchor sizes [m], from the training labels.
         counts: frames fitted, skipped, missing; points and labels left out.
         target: class of the labels that the examples hold.
+        beams: elevations of the lidar's beams [degree], see `DetectorConfig`.
     """
 
     folder: Path
@@ -57,12 +60,13 @@ class Cache:
     sizes: tuple[tuple[float, float, float], ...]
     counts: dict[str, Any]
     target: Target = "Car"
+    beams: tuple[float, ...] | None = None
 
     def config(self, model: str) -> DetectorConfig:
         """The detector of this size with this cache's class and anchor sizes."""
         base = preset(self.size, model).config
         anchors = dataclasses.replace(base.anchors, sizes=self.sizes)
-        made = dataclasses.replace(base, target=self.target, anchors=anchors)
+        made = dataclasses.replace(base, target=self.target, anchors=anchors, beams=self.beams)
         # Few anchors overlap a small object by as much as one overlaps a car.
         limits = {"rpn_iou": (0.3, 0.45), "second_iou": (0.45, 0.55)}
         return made if self.target == "Car" else dataclasses.replace(made, **limits)  # type: ignore[arg-type]
@@ -153,22 +157,6 @@ def split_frames(root: Path, splits: Sequence[str]) -> tuple[dict[str, tuple[str
     return found, missing
 
 
-def _anchor_sizes(
-    root: Path, names: Sequence[str], n_sizes: int, target: str
-) -> tuple[tuple[float, float, float], ...]:
-    sizes = [np.zeros((0, 3))]
-    for name in names:
-        labels = read_labels(root / "training" / "label_2" / f"{name}.txt")
-        wanted = (labels.type == target) & (labels.dimensions > 0).all(axis=1)
-        sizes.append(labels.dimensions[wanted][:, [2, 1, 0]])
-    labelled = np.concatenate(sizes)
-    # Clusters of a handful of objects mean nothing; the benchmark's own are the better guess.
-    if len(np.unique(labelled, axis=0)) < 20 * n_sizes:
-        return TARGET_SIZES[target][-n_sizes:]
-    centres = np.round(cluster_sizes(labelled, n_sizes), 3)
-    return tuple((float(a), float(b), float(c)) for a, b, c in centres)
-
-
 def _read_frames(
     folder: Path,
     frames: Sequence[tuple[str, str]],
@@ -214,6 +202,7 @@ def prepare_cache(
     skip_bad: bool = False,
     ground: PlaneConfig | None = None,
     target: str = "Car",
+    beams: int | Sequence[float] | None = None,
     on_frame: Callable[[int, int, str], None] | None = None,
 ) -> Cache:
     """Read every frame of the split lists, check it, and write its example.
@@ -232,6 +221,8 @@ def prepare_cache(
         skip_bad: leave out frames that cannot be used, and count them, instead of stopping.
         ground: where ground planes are looked for; the benchmark's car when left out.
         target: class of the labels; that of the cache to add to, or to be like, counts first.
+        beams: number of the lidar's beams, or their elevations [degree]; from the scans when left
+            out. Those of the other cache count first, too.
         on_frame: called with (done, all, name).
 
     Raises:
@@ -268,8 +259,12 @@ def prepare_cache(
     found, missing = split_frames(root, splits)
     everything = sorted({(frame_part(split), name) for split in found for name in found[split]})
 
+    scans: list[np.ndarray] = []
+
     def make(part: str, name: str) -> tuple[Example, dict[str, int | bool]]:
         frame = read_frame(root, name, part=part, any_size=any_size, may_be_dead=copies)
+        if len(scans) < _SCANS:
+            scans.append(elevations_of(frame.points))
         plane = None
         if like is not None and copies:
             plane = np.asarray(read_example(_example_folder(like.folder, part), name).plane)
@@ -289,12 +284,13 @@ def prepare_cache(
     if like is not None:
         sizes = like.sizes
     elif held is None:
-        sizes = _anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes), wanted)
+        sizes = anchor_sizes(root, kept[splits[0]], len(config.anchors.sizes), wanted)
     else:
         sizes, kept = held.sizes, held.splits | kept
         skipped = held.counts["skipped"] | counts.pop("skipped")
         counts = {k: n + held.counts[k] for k, n in counts.items()} | {"skipped": skipped}
-    cache = Cache(folder, root, size, kept, sizes, counts, wanted)
+    told = other.beams if other is not None else beams_of_scans(scans, beams)
+    cache = Cache(folder, root, size, kept, sizes, counts, wanted, told)
     record = dataclasses.asdict(cache) | {"folder": str(folder), "root": str(root)}
     temporary = folder / ".cache.json"
     temporary.write_text(json.dumps(record, indent=1), encoding="utf-8")
@@ -316,4 +312,5 @@ def open_cache(folder: Path) -> Cache:
         sizes=tuple((a, b, c) for a, b, c in held["sizes"]),
         counts=held["counts"],
         target=held.get("target", "Car"),
+        beams=None if held.get("beams") is None else tuple(held["beams"]),
     )

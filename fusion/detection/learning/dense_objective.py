@@ -39,6 +39,7 @@ from fusion.detection.learning.params import DetectorParams
 from fusion.detection.network.dense import DenseAuxiliary, DenseDetector, Grids
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import Detections
+from fusion.detection.sensors.platt import Calibration, rescaled
 from fusion.gating import drop_modalities
 
 
@@ -118,7 +119,13 @@ def dense_loss(
     return total, (terms, stats)
 
 
-def dense_detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Detections:
+def dense_detect(
+    config: DetectorConfig,
+    main: Any,
+    stats: Any,
+    inputs: Inputs,
+    calibration: Calibration | None = None,
+) -> Detections:
     """Detections of a batch of frames, inside jit: peaks of the heat, rotated suppression.
 
     A peak's box is the mean of what the cells around it tell (`average_cells`).
@@ -149,4 +156,5 @@ def dense_detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) 
         scores = jnp.where(found, top[kept], 0.0)
         return Detections(boxes[kept], scores, found, weights, jax.nn.sigmoid(failed))
 
-    return jax.vmap(one)(outputs, inputs.plane, grids.weights, grids.failed)
+    told = rescaled(calibration, grids.failed)
+    return jax.vmap(one)(outputs, inputs.plane, grids.weights, told)

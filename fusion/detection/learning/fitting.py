@@ -36,6 +36,7 @@ from fusion.detection.learning.training import (
 )
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import Detections
+from fusion.detection.sensors.platt import AS_TOLD, Calibration
 from fusion.loop import TrainingDiverged
 
 
@@ -245,6 +246,7 @@ def run_detector(
     failure: str | None = None,
     severity: float = 1.0,
     seed: int = 0,
+    calibration: Calibration | None = None,
     on_frame: Callable[[int], None] | None = None,
 ) -> list[Detections]:
     """Detections of every frame, on the host.
@@ -255,18 +257,20 @@ def run_detector(
         examples: frames, taken one at a time.
         failure: of `FAILURES`, in every frame; None for none.
         severity: of the failure; seed: of its noise, which depends on the frame's position too.
+        calibration: of the told failures (`calibrate_told_failures`); they are as the head tells
+            them when left out.
         on_frame: called with the number of frames done.
 
     Returns:
         One `Detections` per frame, in order.
     """
-    run = _detect(config)
+    run, reading = _detect(config), AS_TOLD if calibration is None else calibration
     out = []
     for i, example in enumerate(examples):
         inputs = failed_inputs(
             config, example, failure=failure, severity=severity, seed=seed, position=i
         )
-        found = run(state.params["main"], state.stats, inputs)
+        found = run(state.params["main"], state.stats, inputs, reading)
         found = jax.tree.map(lambda a: a[0], found)
         out.append(jax.device_get(found))
         if on_frame is not None:

@@ -14,9 +14,16 @@ from fusion.detection.kitti.objects import Objects
 from fusion.detection.network.forward import encode, propose_boxes, score_proposals
 from fusion.detection.network.inputs import Inputs
 from fusion.detection.network.proposals import Detections, decode_second, final_boxes
+from fusion.detection.sensors.platt import Calibration, rescaled
 
 
-def detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Detections:
+def detect(
+    config: DetectorConfig,
+    main: Any,
+    stats: Any,
+    inputs: Inputs,
+    calibration: Calibration | None = None,
+) -> Detections:
     """Both stages on a batch of frames, inside jit.
 
     Args:
@@ -24,6 +31,7 @@ def detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Det
         main: `params["main"]`; the auxiliary side and the lattice are not needed.
         stats: of batch norm.
         inputs: batch of frames.
+        calibration: of the told failures; as the head tells them when left out.
 
     Returns:
         `Detections` with a leading axis of frames.
@@ -34,7 +42,7 @@ def detect(config: DetectorConfig, main: Any, stats: Any, inputs: Inputs) -> Det
     scores, moves, angle = score_proposals(config, main, encoded, scale, inputs, proposals).outputs
     boxes = jax.vmap(decode_second)(proposals, moves, angle, inputs.plane)
     return jax.vmap(lambda b, s, m, w, f: final_boxes(config, b, s, m, w, f))(
-        boxes, scores, found, encoded.weights, encoded.failed
+        boxes, scores, found, encoded.weights, rescaled(calibration, encoded.failed)
     )
 
 

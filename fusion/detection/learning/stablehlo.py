@@ -18,6 +18,7 @@ from fusion.detection.learning.examples import Example, camera_frame, make_input
 from fusion.detection.learning.inference import detect
 from fusion.detection.learning.training import DetectorState
 from fusion.detection.network.proposals import Detections
+from fusion.detection.sensors.platt import Calibration
 
 
 def resize_image(image: UInt8[Array, "h w 3"], size: tuple[int, int]) -> Float[Array, "r c 3"]:
@@ -53,6 +54,7 @@ def detect_raw(
     to_camera: Float[Array, "3 4"],
     p2: Float[Array, "3 4"],
     plane: Float[Array, "4"],
+    calibration: Calibration | None = None,
 ) -> Detections:
     """Detections of one frame as it was read, inside jit: resizing, maps, network, suppression.
 
@@ -64,6 +66,7 @@ def detect_raw(
         to_camera: lidar to rectified camera, R0_rect Tr_velo_to_cam.
         p2: projection into the image.
         plane: ground plane a, b, c, d.
+        calibration: of the told failures.
     """
     size = (image.shape[0], image.shape[1])
     mask = _seen(config, points, to_camera, p2, size)
@@ -85,7 +88,7 @@ def detect_raw(
     inputs = make_inputs(config, example, image=resize_image(image, config.image_size))
     run = dense_detect if config.is_dense else detect
     batch = jax.tree.map(lambda a: a[None], inputs)
-    found = run(config, state.params["main"], state.stats, batch)
+    found = run(config, state.params["main"], state.stats, batch, calibration)
     return Detections(*(field[0] for field in found))
 
 
@@ -97,6 +100,7 @@ def write_detector(
     image_size: tuple[int, int],
     n_points: int = 131_072,
     platforms: Sequence[str] = ("cpu",),
+    calibration: Calibration | None = None,
 ) -> None:
     """Write a detector with its parameters as one file that `jax.export.deserialize` reads.
 
@@ -110,6 +114,8 @@ def write_detector(
         image_size: rows and columns of the images that it will get.
         n_points: rows of its scans, the spare ones NaN.
         platforms: where the program is to run, such as `("cpu", "cuda")`.
+        calibration: of the told failures (`calibrate_told_failures`); they are as the head tells
+            them when left out.
 
     Raises:
         ModuleNotFoundError: flatbuffers is missing, which jax writes programs with.
@@ -134,7 +140,10 @@ def write_detector(
         )
 
     def program(*frame: Array) -> tuple[Array, ...]:
-        return tuple(detect_raw(config, state, *frame))
+        image, points, *geometry = frame
+        to_camera, p2, plane = geometry
+        found = detect_raw(config, state, image, points, to_camera, p2, plane, calibration)
+        return tuple(found)
 
     shapes = [
         jax.ShapeDtypeStruct((*image_size, 3), jnp.uint8),

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+from functools import partial
 from typing import Any, Literal, NamedTuple
 
 import jax
@@ -200,9 +201,8 @@ def fail_sensor(
     if failure not in FAILURES:
         raise ValueError(f"failure={failure!r}: expected one of {', '.join(FAILURES)}")
     sensor, _, kind = failure.partition("_")
-    told = jnp.asarray(severity, jnp.float32) * jnp.array(
-        [sensor != "lidar", sensor != "camera"], jnp.float32
-    )
+    concerned = jnp.array([sensor != "lidar", sensor != "camera"], jnp.float32)
+    told = jnp.asarray(severity, jnp.float32) * concerned
     if sensor == "camera":
         image = jnp.asarray(example.image).astype(jnp.float32) / 255.0
         depth = frame_depth(config, example) if kind == "fog" else None
@@ -210,12 +210,11 @@ def fail_sensor(
         return make_inputs(config, example, image=failed_image, told=told)
     points, mask = jnp.asarray(example.points), jnp.asarray(example.point_mask)
     if failure in MISALIGNMENTS:
-        to_camera, truth, labelled = (
-            jnp.asarray(a) for a in (example.to_camera, example.truth, example.truth_mask)
-        )
+        frame = (example.to_camera, example.truth, example.truth_mask)
+        to_camera, truth, labelled = (jnp.asarray(a) for a in frame)
         points = misaligned(points, mask, to_camera, truth, labelled, failure, severity, key=key)
         return make_inputs(config, example, points=(points, mask), told=told)
-    failed = lidar_failure(points, mask, kind, severity, key=key)
+    failed = lidar_failure(points, mask, kind, severity, key=key, beams=config.beam_elevations)
     return make_inputs(config, example, points=failed, told=told)
 
 
@@ -247,9 +246,10 @@ def training_inputs(
             ),
             lambda: image,
         )
+        lose = partial(random_lidar_failure, kinds=kinds["lidar"], beams=config.beam_elevations)
         points, mask = jax.lax.cond(
             failed[1],
-            lambda: random_lidar_failure(points, mask, severity, kinds=kinds["lidar"], key=noise),
+            lambda: lose(points, mask, severity, key=noise),
             lambda: (points, mask),
         )
     turn = None

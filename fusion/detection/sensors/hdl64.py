@@ -24,20 +24,22 @@ AZIMUTH_STEP = float(np.radians(0.1728))
 RANGE_NOISE = 0.02
 """Standard deviation of a range [m]."""
 
-_BORDERS = -(ELEVATIONS[1:] + ELEVATIONS[:-1]) / 2  # ascending
 
-
-def beam_of(points: Float[Array, "n c"]) -> Int[Array, "n"]:
-    """Which beam measured a point: the one of nearest elevation, 0 (top) to 63.
+def beam_of(
+    points: Float[Array, "n c"], elevations: Float[np.ndarray, " b"] = ELEVATIONS
+) -> Int[Array, "n"]:
+    """Which beam measured a point: the one of nearest elevation, 0 for the top one.
 
     Args:
         points: `[n, >= 3]` x, y, z in the lidar frame [m]. The beams of the real sensor do not all
             start in the origin, so near points of real scans can be off by a beam or two.
+        elevations: of the lidar's beams from the top one down [rad]; the HDL-64E's when left out.
 
     Example:
         >>> import jax.numpy as jnp
         >>> beam_of(jnp.array([[20.0, 0.0, 0.7], [10.0, 0.0, -4.0]])).tolist()
         [0, 58]
     """
+    borders = -(elevations[1:] + elevations[:-1]) / 2  # ascending
     elevation = jnp.arctan2(points[:, 2], jnp.hypot(points[:, 0], points[:, 1]))
-    return jnp.searchsorted(jnp.asarray(_BORDERS), -elevation)
+    return jnp.searchsorted(jnp.asarray(borders), -elevation)

@@ -8,7 +8,7 @@ r"""Failures of the lidar, as pure functions of a key on scans of fixed size.
 lidar            severity s
 ===============  ===================================================================================
 noise            range error of 1 m (sd) along the beam at s = 1, reflectance error of 0.3
-beam_loss        a share s of the beams returns nothing, at most 60 of 64
+beam_loss        a share s of the beams returns nothing; at least one of 16 stays (4 of 64)
 sector_dropout   a sector of the view ahead returns nothing, 60 degrees wide at s = 1
 loss             no point at any s > 0
 ===============  ===================================================================================
@@ -21,13 +21,15 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, get_args
 
 import jax
 import jax.numpy as jnp
+import numpy as np
 from jaxtyping import Array, Bool, Float, PRNGKeyArray
 
-from fusion.detection.sensors.hdl64 import N_BEAMS, beam_of
+from fusion.detection.sensors.hdl64 import ELEVATIONS, beam_of
 from fusion.detection.sensors.severity import Severity, check_failure
 
 LidarFailure = Literal["noise", "beam_loss", "sector_dropout", "loss"]
@@ -35,12 +37,22 @@ LIDAR_FAILURES: tuple[LidarFailure, ...] = get_args(LidarFailure)
 
 RANGE_ERROR = 1.0  # sd [m]
 REFLECTANCE_ERROR = 0.3  # sd
-MAX_LOST_BEAMS = 60
+BEAMS_PER_KEPT = 16
 SECTOR_WIDTH = math.radians(60.0)
 VIEW_HALF = math.radians(40.0)  # the camera sees 40 degrees to each side
 
+Beams = Float[np.ndarray, " b"]
 Points = Float[Array, "n 4"]
 Mask = Bool[Array, "n"]
+
+
+def _check_beams(kinds: Sequence[str], beams: Beams) -> None:
+    if "beam_loss" in kinds and len(beams) < 2:
+        raise ValueError(
+            f"beams={beams.tolist()}: expected the elevations of the lidar's beams, which its "
+            "scans do not show; prepare the frames with their number or elevations (`--beams`, "
+            "`--beam-elevations`), or leave out lidar_beam_loss"
+        )
 
 
 def _range_noise(key: PRNGKeyArray, points: Array, mask: Array, s: Array) -> tuple[Array, Array]:
@@ -55,10 +67,14 @@ def _range_noise(key: PRNGKeyArray, points: Array, mask: Array, s: Array) -> tup
     return jnp.concatenate([place, jnp.clip(light, 0.0, 1.0)[:, None]], axis=1), mask
 
 
-def _beam_loss(key: PRNGKeyArray, points: Array, mask: Array, s: Array) -> tuple[Array, Array]:
-    n_lost = jnp.minimum(jnp.round(s * N_BEAMS).astype(jnp.int32), MAX_LOST_BEAMS)
-    lost = jax.random.permutation(key, N_BEAMS) < n_lost
-    return points, mask & ~lost[beam_of(points)]
+def _beam_loss(
+    key: PRNGKeyArray, points: Array, mask: Array, s: Array, *, beams: Beams
+) -> tuple[Array, Array]:
+    n = len(beams)
+    most = n - max(1, n // BEAMS_PER_KEPT)
+    n_lost = jnp.minimum(jnp.round(s * n).astype(jnp.int32), most)
+    lost = jax.random.permutation(key, n) < n_lost
+    return points, mask & ~lost[beam_of(points, beams)]
 
 
 def _sector_dropout(key: PRNGKeyArray, points: Array, mask: Array, s: Array) -> tuple[Array, Array]:
@@ -74,14 +90,19 @@ def _loss(key: PRNGKeyArray, points: Array, mask: Array, s: Array) -> tuple[Arra
 
 _LIDAR: dict[str, Callable[..., tuple[Array, Array]]] = {
     "noise": _range_noise,
-    "beam_loss": _beam_loss,
     "sector_dropout": _sector_dropout,
     "loss": _loss,
 }
 
 
 def lidar_failure(
-    points: Points, mask: Mask, kind: str, severity: Severity = 1.0, *, key: PRNGKeyArray
+    points: Points,
+    mask: Mask,
+    kind: str,
+    severity: Severity = 1.0,
+    *,
+    key: PRNGKeyArray,
+    beams: Beams = ELEVATIONS,
 ) -> tuple[Points, Mask]:
     """What a failed lidar would have measured.
 
@@ -91,12 +112,15 @@ def lidar_failure(
         kind: one of `LIDAR_FAILURES` (static).
         severity: 0 returns points and mask as they are, 1 is the strongest; may be traced.
         key: typed PRNG key.
+        beams: elevations of the lidar's beams from the top one down [rad] (static), see
+            `find_beams`; those of the HDL-64E when left out.
 
     Returns:
         points and mask of the same sizes; rows that are no points any more are 0.
 
     Raises:
-        ValueError: unknown kind (the message lists the known ones) or severity outside [0, 1].
+        ValueError: unknown kind (the message lists the known ones) or severity outside [0, 1], or
+            lost beams of a lidar whose beams are not known (an empty array).
 
     Example:
         >>> import jax, jax.numpy as jnp
@@ -105,8 +129,10 @@ def lidar_failure(
         0
     """
     check_failure("lidar", (kind,), LIDAR_FAILURES, severity)
+    _check_beams((kind,), beams)
     s = jnp.asarray(severity, points.dtype)
-    new_points, new_mask = _LIDAR[kind](key, points, mask, s)
+    fail = partial(_beam_loss, beams=beams) if kind == "beam_loss" else _LIDAR[kind]
+    new_points, new_mask = fail(key, points, mask, s)
     new_points = jnp.where(new_mask[:, None], new_points, 0.0)
     return jnp.where(s > 0.0, new_points, points), jnp.where(s > 0.0, new_mask, mask)
 
@@ -118,10 +144,15 @@ def random_lidar_failure(
     *,
     key: PRNGKeyArray,
     kinds: Sequence[str] = LIDAR_FAILURES,
+    beams: Beams = ELEVATIONS,
 ) -> tuple[Points, Mask]:
     """`lidar_failure` of a kind that is drawn evenly from `kinds`. Raises like it."""
     check_failure("lidar", kinds, LIDAR_FAILURES, severity)
+    _check_beams(kinds, beams)
     choice, rest = jax.random.split(key)
-    branches = [lambda k, p, m, s, kind=kind: lidar_failure(p, m, kind, s, key=k) for kind in kinds]
+    branches = [
+        lambda k, p, m, s, kind=kind: lidar_failure(p, m, kind, s, key=k, beams=beams)
+        for kind in kinds
+    ]
     index = jax.random.randint(choice, (), 0, len(branches))
     return jax.lax.switch(index, branches, rest, points, mask, jnp.asarray(severity, points.dtype))

@@ -149,9 +149,7 @@ def execute(run: Run, dataset: Any, preset: str) -> dict[str, Any]:
     if run.model in CEILINGS:
         found = dict(score(run.model, dataset, case.noise, run.seed))
     elif run.model == "dedicated":
-        found = dedicated(
-            dataset, case.noise, run.seed, preset=preset, epochs=run.case.options.get("epochs")
-        )
+        found = dedicated(dataset, case.noise, run.seed, preset=preset)
     else:
         noise = dataclasses.replace(case.noise, test_kind=run.case.test_kind)
         settings = build_settings(options, dataset)

@@ -39,7 +39,10 @@ def _grid(**options: Any) -> list[Case]:
 
 
 def _long(name: str, n_clean: int, *bounds: str) -> Case:
-    """Four times the epochs of the preset: with few clean sensors each is seldom seen alone."""
+    """Four times the epochs of the preset: with few clean sensors each is seldom seen alone.
+
+    `dedicated` keeps the preset's.
+    """
     options = {"dataset": "har", "protocol": "random", "n_clean": n_clean, "epochs": 60}
     columns = ("baseline", "argate_plus", "argate_l", "oracle", *bounds)
     return Case(name, options, (*columns, "nearest_rows", "linear_fit"))

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import io
 from pathlib import Path
 from typing import Any
 
@@ -102,8 +101,6 @@ def drive(config: Drive) -> dict[str, Any]:
 
 def _save(out: Path, config: Drive, moments: list[Any], area: Any, threshold: Any) -> None:
     """Write the drive as a moving picture or as some of its moments."""
-    from PIL import Image
-
     from fusion.detection.drive_plots import plot_drive, plot_moments
 
     out.parent.mkdir(parents=True, exist_ok=True)
@@ -111,8 +108,5 @@ def _save(out: Path, config: Drive, moments: list[Any], area: Any, threshold: An
         moving = plot_drive(moments, area, config.failure, threshold)
         moving.save(out, writer="pillow", fps=config.fps, dpi=config.dpi)
         return
-    drawing = io.BytesIO()
-    plot_moments(moments, area, config.failure, threshold).savefig(drawing, dpi=config.dpi)
-    with Image.open(drawing) as picture:
-        # A palette makes the file a third as large.
-        picture.convert("RGB").quantize(128).save(out, optimize=True)
+    # No palette: it would merge the few green pixels of the labels into another colour.
+    plot_moments(moments, area, config.failure, threshold).savefig(out, dpi=config.dpi)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+import warnings
+from collections.abc import Iterator
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +43,8 @@ def test_it_fits_scores_and_survives_a_missing_sensor() -> None:
     found = model.predict_sensors(gone)
     assert found.failed[:, 1].all() and (found.weights[:, 1] == 0).all()
     np.testing.assert_allclose(model.predict_proba(X).sum(1), 1.0, rtol=1e-5)
+    with pytest.raises(ValueError, match="infinity"):
+        model.predict(np.where(X > 0, np.inf, X))
 
 
 def test_scikit_learn_can_use_it() -> None:
@@ -86,17 +90,39 @@ QUICK = (
     *("check_estimator_repr", "check_no_attributes_set_in_init", "check_estimators_unfitted"),
 )
 """Checks of scikit-learn that train nothing."""
+DOES_NOT_APPLY = {
+    "check_estimators_nan_inf": "predict reads NaN as an absent sensor; training and infinity are "
+    "checked by tests of their own",
+}
+
+UNTYPED = ("check_do_not_raise_errors_in_init_or_set_params",)
+"""Checks that give numbers for names, which the suite refuses before the code under test is run."""
 
 
-@pytest.mark.parametrize("estimator", [ARGateClassifier(), ARGateRegressor()], ids=["c", "r"])
-def test_checks_of_scikit_learn_pass(estimator: Any) -> None:
-    ran = []
-    for one, check in estimator_checks_generator(estimator):
-        name = getattr(check, "func", check).__name__
-        if name in QUICK:
-            check(one)
-            ran.append(name)
-    assert set(ran) == set(QUICK)
+def _checks() -> Iterator[Any]:
+    """All checks of scikit-learn, for networks that are small and still learn its easy tasks."""
+    fast: dict[str, Any] = {"epochs": 12, "features": 6, "batch_size": 16, "learning_rate": 1e-2}
+    for estimator in (
+        ARGateClassifier(gate_width=6, head_width=8, **fast),
+        ARGateRegressor(width=8, **fast),
+    ):
+        for one, check in estimator_checks_generator(estimator):
+            plain = getattr(check, "func", check).__name__
+            options = "-".join(map(str, getattr(check, "keywords", {}).values()))
+            marks = [] if plain in QUICK else [pytest.mark.slow]
+            if why := DOES_NOT_APPLY.get(plain):
+                marks.append(pytest.mark.xfail(reason=why, strict=True))
+            if plain in UNTYPED:
+                marks.append(pytest.mark.skip("needs a process without runtime type checks"))
+            name = f"{type(one).__name__}-{plain}-{options}"
+            yield pytest.param(one, check, id=name, marks=marks)
+
+
+@pytest.mark.parametrize(("estimator", "check"), list(_checks()))
+def test_checks_of_scikit_learn_pass(estimator: Any, check: Any) -> None:
+    with warnings.catch_warnings():
+        warnings.simplefilter("ignore")  # the checks' own
+        check(estimator)
 
 
 def test_an_oracle_is_refused_and_training_rows_of_a_classifier_hold_no_nan() -> None:

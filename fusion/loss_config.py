@@ -70,7 +70,7 @@ class LossParams(_LossParams):
 
 
 Imitation = Literal["squared", "kl"]
-TargetTraining = Literal["imitation", "held_out"]
+TargetTraining = Literal["imitation", "held_out", "experts"]
 
 
 @dataclasses.dataclass(frozen=True)
@@ -86,7 +86,8 @@ class LossConfig:
         imitation: how far weights lie from targets: `"squared"` as printed, or `"kl"`, see
             `distance_to_targets`.
         target_training: what learned targets are trained by: `"imitation"` of the weights as in
-            Equation 3.2, or `"held_out"` rows, see `fusion.bilevel`.
+            Equation 3.2, `"held_out"` rows, see `fusion.bilevel`, or a product of the auxiliary
+            paths' `"experts"`, see `fusion.losses.product_of_experts`.
         mask_supervision: the weights learn from the mask of simulated failures, see `mask_penalty`.
         stop_targets: no gradient from the regularization into the auxiliary losses; without it
             the auxiliary heads can be made worse to please the gate.
@@ -128,10 +129,10 @@ class LossConfig:
         check_choice("fixed_targets", self.fixed_targets, get_args(Normalizer))
         check_choice("imitation", self.imitation, get_args(Imitation))
         check_choice("target_training", self.target_training, get_args(TargetTraining))
-        if self.target_training == "held_out" and not self.learned_targets:
+        if self.target_training != "imitation" and not self.learned_targets:
             raise ValueError(
-                "target_training='held_out': expected learned_targets=True with it; fixed targets "
-                "are not trained"
+                f"target_training={self.target_training!r}: expected learned_targets=True with it; "
+                "fixed targets are not trained"
             )
         for name in ("uniform_floor", "label_smoothing"):
             check_number(name, getattr(self, name), 0.0, 1.0, fix="it is a share")

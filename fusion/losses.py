@@ -107,6 +107,26 @@ def mask_penalty(weights: Float[Array, "b k"], failed: Bool[Array, "b k"]) -> Fl
     return -jnp.sum(oracle_weights(failed) * jnp.log(weights + 1e-6), axis=-1)
 
 
+def product_of_experts(
+    targets: Float[Array, "b k"], aux_logits: Float[Array, "b k c"], labels: Int[Array, " b"]
+) -> Float[Array, " b"]:
+    r"""Cross entropy of the auxiliary paths' joint opinion, with the targets as exponents.
+
+    .. math:: -\log \frac{\prod_k p_k(y)^{f_k}}{\sum_c \prod_k p_k(c)^{f_k}}
+
+    It trains the targets and not the paths: no gradient flows into the logits.
+
+    Source: Hinton (2002), products of experts; Shim (2020), Eq. 3.2, for f.
+
+    Example:
+        >>> experts = jnp.log(jnp.array([[[0.9, 0.1], [0.5, 0.5]]]))
+        >>> round(float(product_of_experts(jnp.ones((1, 2)), experts, jnp.array([0]))[0]), 4)
+        0.1054
+    """
+    experts = jax.lax.stop_gradient(jax.nn.log_softmax(aux_logits, axis=-1))
+    return cross_entropy(jnp.einsum("bk,bkc->bc", targets, experts), labels)
+
+
 def gate_penalty(
     config: LossConfig,
     params: LossParams,
@@ -177,6 +197,7 @@ def argate_loss(
     weights: Float[Array, "b k"],
     aux_losses: Float[Array, "b k"] | None = None,
     targets: Float[Array, "b k"] | None = None,
+    aux_logits: Float[Array, "b k c"] | None = None,
 ) -> LossTerms:
     r"""The training loss of a classifier with a gate and auxiliary paths.
 
@@ -193,9 +214,14 @@ def argate_loss(
         weights: fusion weights w.
         aux_losses: cross entropy of each auxiliary path, per example; None without auxiliary paths.
         targets: learned targets f_k(aux_losses); None for the fixed ones.
+        aux_logits: of the auxiliary paths, for `target_training="experts"`, which adds
+            `product_of_experts` to the total and lets nothing else train the targets.
 
     Returns:
         The terms, scalars.
+
+    Raises:
+        ValueError: targets that experts train, and no `aux_logits`.
 
     Source: Shim (2020), Eq. 3.1 and 3.2.
 
@@ -209,5 +235,16 @@ def argate_loss(
     if not config.auxiliary or aux_losses is None:
         zero = jnp.zeros_like(main)
         return LossTerms(main, main, zero, zero, zero)
+    judged = jnp.zeros_like(main)
+    if config.target_training == "experts" and targets is not None:
+        if aux_logits is None:
+            raise ValueError(
+                "aux_logits=None: expected the logits of the auxiliary paths, which "
+                "target_training='experts' reads; give them"
+            )
+        judged = jnp.mean(product_of_experts(targets, aux_logits, labels))
+        targets = jax.lax.stop_gradient(targets)
     gate = gate_penalty(config, params, weights, aux_losses, targets)
-    return LossTerms(main + gate.total, main, gate.auxiliary, gate.regularization, gate.anchor)
+    return LossTerms(
+        main + gate.total + judged, main, gate.auxiliary, gate.regularization, gate.anchor
+    )

@@ -217,6 +217,13 @@ class ARGateLoss(nn.Module):
                 "config.auxiliary=True: expected a model with auxiliary_heads; give them, or turn "
                 "the terms off"
             )
+        for name, wanted in (("mask_supervision", False), ("target_training", "imitation")):
+            if (given := getattr(config, name)) != wanted:
+                raise ValueError(
+                    f"config.{name}={given!r}: expected {wanted!r}, for an ARGateLoss knows no "
+                    "masks and takes no steps; add fusion.losses.mask_penalty or "
+                    "product_of_experts to its terms"
+                )
         if config.learned_targets != (self.model.targets is not None):
             raise ValueError(
                 f"config.learned_targets={config.learned_targets}: expected a model "

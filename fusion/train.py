@@ -100,22 +100,22 @@ def batch_loss(
 
     `failed` is a part of the batch, as in `fusion.failures.corrupt`: the oracle's gate and mask
     supervision read it, the metrics of a step do for all models. Differentiable in `params` and in
-    `hyper.loss`; see `fusion.losses.argate_loss`. A variational
-    gate adds its divergence from the prior over `n_examples`, the training rows; over the rows of
-    the batch when None.
+    `hyper.loss`; see `fusion.losses.argate_loss`. A variational gate adds its divergence from the
+    prior over `n_examples`, the training rows; over the rows of the batch when None.
     """
     told = failed if model.reads_failed else None
     out = predict(model, export(params), x, told, excluded=excluded, key=key)
-    aux_losses = targets = None
+    aux_losses = targets = aux_logits = None
     config = model.recipe.loss
     if config.auxiliary:
         aux_logits = auxiliary_logits(model, params, x, out.features)
         labels = jnp.broadcast_to(y[:, None], aux_logits.shape[:2])
         aux_losses = cross_entropy(aux_logits, labels)
         if config.learned_targets:
-            given = jax.lax.stop_gradient(aux_losses) if config.stop_targets else aux_losses
-            targets = apply_targets(model.targets, params["targets"], given)
-    loss = argate_loss(config, hyper.loss, out.logits, y, out.weights, aux_losses, targets)
+            seen = jax.lax.stop_gradient(aux_losses) if config.stop_targets else aux_losses
+            targets = apply_targets(model.targets, params["targets"], seen)
+    given = aux_losses, targets, aux_logits
+    loss = argate_loss(config, hyper.loss, out.logits, y, out.weights, *given)
     if config.mask_supervision:
         penalty = jnp.mean(mask_penalty(out.weights, failed))
         loss = loss._replace(total=loss.total + hyper.loss.mask * penalty)

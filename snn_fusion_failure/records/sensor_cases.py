@@ -53,6 +53,8 @@ _GATES = {
     "kl": ("model.loss.imitation=kl",),
     "held out": ("model.loss.target_training=held_out",),
     "kl, held out": ("model.loss.imitation=kl", "model.loss.target_training=held_out"),
+    "experts": ("model.loss.target_training=experts",),
+    "kl, experts": ("model.loss.imitation=kl", "model.loss.target_training=experts"),
     "masks": ("model.loss.mask_supervision=true",),
 }
 

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 
+import flax.linen as nn
 import jax
 import jax.numpy as jnp
 import numpy as np
@@ -18,8 +19,10 @@ from fusion.losses import (
     distance_to_targets,
     loss_targets,
     mask_penalty,
+    product_of_experts,
 )
-from fusion.train import init_state, train_step
+from fusion.modules import ARGate, ARGateLoss, LatticeTargets
+from fusion.train import batch_loss, init_state, train_step
 
 
 def test_the_divergence_is_that_of_numpy_and_zero_only_for_equal_shares() -> None:
@@ -79,6 +82,45 @@ def test_printed_models_follow_the_equations_to_the_letter() -> None:
     )
 
 
+def test_a_product_of_experts_trusts_the_path_that_is_right() -> None:
+    """Two paths, the first right and the second wrong with the same confidence."""
+    logits = jnp.log(jnp.array([[[0.8, 0.2], [0.2, 0.8]]]))
+    y = jnp.array([0])
+    slope = jax.grad(lambda f: product_of_experts(f, logits, y)[0])(jnp.array([[0.5, 0.5]]))
+    # -log softmax of f_1 a - f_2 a with a = log 4, at equal exponents: slopes -a / 2 and a / 2.
+    np.testing.assert_allclose(slope, [[-np.log(4.0) / 2, np.log(4.0) / 2]], rtol=1e-5)
+    alone = product_of_experts(jnp.array([[1.0, 0.0]]), logits, y)
+    assert float(alone[0]) == pytest.approx(-np.log(0.8), rel=1e-5)
+    still = jax.grad(lambda z: product_of_experts(jnp.ones((1, 2)), z, y)[0])(logits)
+    assert not np.any(still)
+
+
+@pytest.mark.relaxed  # optax
+def test_experts_train_the_targets_and_no_path() -> None:
+    x, y = jnp.ones((8, 3, 1)), jnp.arange(8) % 2
+    failed = jnp.zeros((8, 3), bool)
+    key, grads = jax.random.key(0), {}
+    for training in ("imitation", "experts"):
+        # beta and the anchor alone would move nothing but the gate.
+        loss = LossConfig(target_training=training, label_smoothing=0.0)
+        model = ModelConfig("argate_l", n_sensors=3, n_times=1, n_classes=2, loss=loss)
+        params = init_state(key, model, TrainConfig(batch_size=8)).params
+        hyper = HyperParams(loss=LossParams(alpha=0.0, beta=1.0, anchor=0.0))
+        grads[training] = jax.grad(
+            lambda p, m=model, h=hyper: batch_loss(m, h, p, x, y, failed)[0]
+        )(params)
+    for part in ("main", "aux"):
+        jax.tree.map(
+            np.testing.assert_array_equal, grads["experts"][part], grads["imitation"][part]
+        )
+    apart = jax.tree.map(
+        lambda a, b: float(jnp.abs(a - b).max()),
+        grads["experts"]["targets"],
+        grads["imitation"]["targets"],
+    )
+    assert max(jax.tree.leaves(apart)) > 1e-4
+
+
 @pytest.mark.relaxed  # optax
 def test_a_step_with_masks_and_held_out_rows_moves_gate_and_targets() -> None:
     loss = LossConfig(imitation="kl", target_training="held_out", mask_supervision=True)
@@ -111,6 +153,14 @@ def test_what_the_gate_learns_from_is_checked() -> None:
         LossConfig(imitation="mse")
     with pytest.raises(ValueError, match="target_training='held_out'"):
         LossConfig(learned_targets=False, target_training="held_out")
+    with pytest.raises(ValueError, match="target_training='experts'"):
+        LossConfig(learned_targets=False, target_training="experts")
+    for change in ({"mask_supervision": True}, {"target_training": "experts"}):
+        (name,) = change
+        net = ARGate((nn.Dense(2),) * 2, nn.Dense(2), (nn.Dense(2),) * 2, LatticeTargets())
+        loss = ARGateLoss(net, LossConfig(label_smoothing=0.0, **change))
+        with pytest.raises(ValueError, match=f"config.{name}="):
+            loss.init(jax.random.key(0), LossParams(), [jnp.ones((4, 3))] * 2, jnp.arange(4) % 2)
     told = dataclasses.replace(MODELS["baseline"].loss, mask_supervision=True)
     with pytest.raises(ValueError, match="mask_supervision=True"):
         ModelConfig("baseline", loss=told)

@@ -178,26 +178,33 @@ def embrace(
     keep: Float[Array, "b k"] | None = None,
     *,
     key: Key[Array, ""] | None = None,
+    shared: bool = False,
 ) -> Float[Array, "b f"]:
     r"""EmbraceNet fusion: each feature is taken from one sensor, drawn at random.
 
     .. math:: h_i = z_{r_i, i}, \quad r_i \sim \text{Categorical}(p)
 
-    Without a key (at inference) the expectation :math:`\sum_k p_k z_{k,i}` is used, so that the
-    result is a function of the input alone.
+    Without a key the expectation :math:`\sum_k p_k z_{k,i}` is taken, on which the layers behind
+    it were not trained.
 
     Args:
         features: docked features of the K sensors.
         keep: availability of each sensor, `[batch, branch]`; all available when None.
         key: PRNG key of the draws, or None for the expectation.
+        shared: one draw for all examples, so that what becomes of one does not depend on the batch
+            that it is in.
 
-    Source: Choi and Lee (2019), EmbraceNet. Deviation: the expectation at inference.
+    Source: Choi and Lee (2019), EmbraceNet.
     """
     k, b, f = features.shape
     weights = jnp.ones((b, k)) if keep is None else keep
     p = weights / jnp.maximum(1e-9, jnp.sum(weights, axis=-1, keepdims=True))
     if key is None:
         return jnp.einsum("bk,kbf->bf", p, features)
-    choice = jax.random.categorical(key, jnp.log(p + 1e-9)[:, None, :], axis=-1, shape=(b, f))
+    logits = jnp.log(p + 1e-9)[:, None, :]
+    if shared:
+        choice = jnp.argmax(logits + jax.random.gumbel(key, (1, f, k), p.dtype), axis=-1)
+    else:
+        choice = jax.random.categorical(key, logits, axis=-1, shape=(b, f))
     selected = jax.nn.one_hot(choice, k, axis=0, dtype=features.dtype)
     return jnp.sum(selected * features, axis=0)

@@ -106,7 +106,9 @@ class FusionNet(nn.Module):
         if recipe.gate == "embrace":
             docked = nn.relu(stacked_dense(self, "dock", used, config.embrace_width))
             keep = None if available is None else available.astype(docked.dtype)
-            h = embrace(docked, keep, key=None if key is None else jax.random.fold_in(key, 1))
+            # At inference it draws, too: the head knows nothing else. The draw is always the same.
+            drawn = jax.random.key(0) if key is None else jax.random.fold_in(key, 1)
+            h = embrace(docked, keep, key=drawn, shared=key is None)
         else:
             h = apply_weights(used, weights, config.fusion, config.scale)
         for layer, width in enumerate((*config.head_widths, config.n_classes)):

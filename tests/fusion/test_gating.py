@@ -90,3 +90,5 @@ def test_embrace_takes_each_feature_from_one_available_sensor() -> None:
     assert set(np.unique(drawn)) == {0.0, 2.0}
     np.testing.assert_allclose(drawn.mean(), 1.0, atol=0.06)
     np.testing.assert_allclose(embrace(features, keep), 1.0)
+    same = np.asarray(embrace(features, keep, key=jax.random.key(0), shared=True))
+    assert set(np.unique(same)) == {0.0, 2.0} and (same == same[0]).all()

@@ -103,6 +103,20 @@ def test_ablations_reach_the_loss() -> None:
         dataclasses.replace(SMALL, model="baseline", loss=LossConfig())
 
 
+def test_embracenet_draws_at_inference_and_alike_in_every_batch() -> None:
+    config = dataclasses.replace(SMALL, model="embracenet", embrace_width=64)
+    main = export(init(jax.random.key(0), config))
+    whole = predict(config, main, X).logits
+    alone = jnp.concatenate([predict(config, main, X[i : i + 1]).logits for i in range(len(X))])
+    np.testing.assert_allclose(whole, alone, rtol=1e-5, atol=1e-6)
+    # One sensor left means that all features are drawn from it.
+    only = jnp.zeros((7, 3), bool).at[:, 1].set(True)
+    told = predict(config, main, X, available=only).logits
+    moved = predict(config, main, X.at[:, 0].set(0.9), available=only).logits
+    np.testing.assert_array_equal(told, moved)
+    assert float(jnp.abs(whole - told).max()) > 1e-3
+
+
 def test_oracle_needs_the_mask_and_uses_it() -> None:
     config = dataclasses.replace(SMALL, model="oracle")
     params = init(jax.random.key(0), config)

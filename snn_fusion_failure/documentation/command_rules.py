@@ -171,7 +171,6 @@ RULES = (
     Rule("reproduce.py --report-only"),
     Rule("reproduce.py --collect-only"),
     Rule("reproduce.py 3.1", _HAR),
-    Rule("reproduce.py 3.4", _HAR),
     Rule("reproduce.py 2.4", "--seeds 1 --models S4"),
     Rule("reproduce.py 2.3", "--preset quick --seeds 1 --models S4"),
     Rule("reproduce.py paper", "--preset quick --table 2.3 --seeds 1 --models S4"),

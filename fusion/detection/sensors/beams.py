@@ -48,7 +48,7 @@ def find_beams(
         >>> import numpy as np
         >>> three = np.repeat(np.radians([-15.0, -5.0, 3.0, 8.0]), 50)
         >>> np.degrees(find_beams(three)).round(2)
-        array([ 8.,  3., -5., -15.], dtype=float32)
+        array([  8.,   3.,  -5., -15.], dtype=float32)
     """
     e = np.sort(np.asarray(elevations, np.float64))
     if n_beams is not None and not FEWEST <= n_beams <= MOST:

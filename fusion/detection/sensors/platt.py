@@ -76,8 +76,8 @@ def fit_platt(
         >>> truth = rng.normal(0.0, 2.0, 20_000)
         >>> failed = rng.uniform(size=20_000) < 1 / (1 + np.exp(-truth))
         >>> slope, offset = fit_platt(4.0 * truth - 8.0, failed)  # too sure, and too seldom
-        >>> round(slope, 1), round(offset, 1)
-        (0.2, 2.0)
+        >>> abs(slope - 0.25) < 0.02, abs(offset - 2.0) < 0.1
+        (True, True)
     """
     x, y = np.asarray(log_odds, np.float64), np.asarray(failed, bool)
     n_failed, n_working = int(y.sum()), int((~y).sum())

@@ -56,7 +56,8 @@ def make(
 
         state, metrics = jax.lax.scan(body, state, jnp.arange(begin, end))
         x, failed = failures.corrupt(protocol, score_x, kind, key=jax.random.fold_in(key, 3))
-        logits, _ = predict_batches(config, export(state.params), x, failed)
+        told = failed if config.reads_failed else None
+        logits, _ = predict_batches(config, export(state.params), x, told)
         hit = (jnp.argmax(logits, -1) == score_y).astype(jnp.float32)
         broken = jnp.any(failed, axis=1)
         loss = metrics.loss.total[-1]

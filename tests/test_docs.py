@@ -45,7 +45,8 @@ def blocks(page: Path) -> list[tuple[bool, str, int]]:
 # These compile or train for twenty seconds and more each.
 LONG = (
     "bayesian_gate", "argate_in_flax", "own_data", "brax_ppo", "lattice_in_flax", "swap_reward",
-    "spiking_encoder", "reversible_encoder",
+    "spiking_encoder", "reversible_encoder", "own_driving_network", "own_map", "sets_of_items",
+    "own_simulator", "own_snn",
 )  # fmt: skip
 
 

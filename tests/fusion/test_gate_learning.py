@@ -106,8 +106,8 @@ def test_experts_train_the_targets_and_no_path() -> None:
         model = ModelConfig("argate_l", n_sensors=3, n_times=1, n_classes=2, loss=loss)
         params = init_state(key, model, TrainConfig(batch_size=8)).params
         hyper = HyperParams(loss=LossParams(alpha=0.0, beta=1.0, anchor=0.0))
-        grads[training] = jax.grad(
-            lambda p, m=model, h=hyper: batch_loss(m, h, p, x, y, failed)[0]
+        grads[training] = jax.jit(
+            jax.grad(lambda p, m=model, h=hyper: batch_loss(m, h, p, x, y, failed)[0])
         )(params)
     for part in ("main", "aux"):
         jax.tree.map(

@@ -62,6 +62,7 @@ def test_submitit_array(alone, tmp_path) -> None:
     same(load(tmp_path), alone, *VARIABLES)
 
 
+@pytest.mark.slow
 def test_ray_goes_on_when_a_worker_is_killed(alone, tmp_path, monkeypatch) -> None:
     """SIGKILL for the first actor that has ended a chunk, while it works on its next one."""
     monkeypatch.setenv("RAY_worker_niceness", "0")  # 15 by default: starved on a busy machine

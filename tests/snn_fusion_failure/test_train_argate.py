@@ -132,6 +132,7 @@ def test_options_reach_the_settings() -> None:
     assert corruption.train != corruption.test
 
 
+@pytest.mark.slow
 def test_without_options_clean_and_failing_cases_stand_side_by_side(
     tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -206,6 +207,7 @@ TINY = {
 }
 
 
+@pytest.mark.slow
 def test_reproduce_goes_on_where_it_was(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:

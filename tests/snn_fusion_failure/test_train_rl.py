@@ -84,6 +84,7 @@ def test_ppo_is_told_of_the_way_on_detours_and_every_map_has_keys_of_its_own(
     assert not (roots["1"] == roots["D1"]).any()
 
 
+@pytest.mark.slow
 @pytest.mark.relaxed  # optax mixes int and float in the bias correction of Adam
 def test_the_way_is_what_ppo_is_rewarded_by_in_training() -> None:
     sizes = dataclasses.replace(

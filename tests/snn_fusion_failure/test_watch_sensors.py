@@ -88,6 +88,7 @@ def test_nothing_is_trained_for_what_cannot_be_shown(
         watch_sensors.main(watch_sensors.Config(preset="quick", **given))
 
 
+@pytest.mark.slow
 def test_own_windows_are_trained_on_from_the_shell(tmp_path: Path) -> None:
     rng = np.random.default_rng(0)
     y = rng.integers(0, 2, 200)

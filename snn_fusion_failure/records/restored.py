@@ -12,11 +12,11 @@ from pathlib import Path
 from typing import Any
 
 from snn_fusion_failure.records import fusion_tables
-from snn_fusion_failure.records.rows import recorded, rows_with_origin, values_by_seed
+from snn_fusion_failure.records.rows import rows_with_origin, values_by_seed
 from snn_fusion_failure.runs import write_json
 
-Scores = dict[tuple[str, str, str], dict[int, float]]
-"""(row, model, metric) -> seed -> value."""
+Held = dict[tuple[str, str, int], dict[str, Any]]
+"""(row, model, seed) -> metric -> value, and `git`."""
 
 
 def unseen_case(table: str, row: str, kind: str | None = None) -> str:
@@ -29,41 +29,37 @@ def channel_case(table: str, row: str, channel: str) -> str:
     return f"Table {table}, {row}: {channel}"
 
 
-def _scores(path: Path) -> Scores:
-    return {(r["row"], r["model"], r["metric"]): values_by_seed(r) for r in recorded(path)}
-
-
-def _robustness(run: fusion_tables.Run, unseen: Scores) -> dict[str, Any]:
+def _robustness(run: fusion_tables.Run, unseen: Held) -> dict[str, Any]:
     """Accuracy under each kind that is never trained on; nothing unless all are held."""
     found = {}
     for kind in fusion_tables.UNSEEN_KINDS:
         case = unseen_case(run.table, run.row.name, kind)
-        value = unseen.get((case, run.model, "accuracy"), {}).get(run.seed)
+        value = unseen.get((case, run.model, run.seed), {}).get("accuracy")
         if value is None:
             return {}
         found[kind] = value
     return {"robustness": found}
 
 
-def _channel(run: fusion_tables.Run, weights: Scores) -> dict[str, Any]:
+def _channel(run: fusion_tables.Run, weights: Held) -> dict[str, Any]:
     """Fusion weights of the channel of Figure 3.7; their means are all that is held."""
     channel = run.row.channel or ""
     found: dict[str, Any] = {}
     for when in ("when_failed", "when_clean"):
         case = channel_case(run.table, run.row.name, channel)
-        value = weights.get((case, run.model, f"weight_{when}"), {}).get(run.seed)
+        value = weights.get((case, run.model, run.seed), {}).get(f"weight_{when}")
         if value is None:
             return {}
         found[when] = [value]
     return {"channel": {"name": channel, "means_only": True, **found}}
 
 
-def held_scores(path: Path) -> dict[tuple[str, str, int], dict[str, Any]]:
-    """(row, model, seed) -> metric -> value, and `git`, of a table of record."""
-    held: dict[tuple[str, str, int], dict[str, Any]] = {}
+def held_scores(path: Path) -> Held:
+    """The single runs that a table of record holds; none where it has not been written."""
+    held: Held = {}
     for row in rows_with_origin(path):
         for seed, value in values_by_seed(row).items():
-            record = held.setdefault((row["row"], row["model"], seed), {"git": row["git"]})
+            record = held.setdefault((row["row"], row["model"], seed), {"git": row.get("git", "")})
             record[row["metric"]] = value
     return held
 
@@ -77,8 +73,8 @@ def restore(tables: Sequence[str], results: Path, out: Path, seeds: int) -> int:
         out: folder of the single runs; what is there stays as it is.
         seeds: seeds below this number.
     """
-    unseen = _scores(results / "study_unseen_kinds.json")
-    weights = _scores(results / "study_channel_weights.json")
+    unseen = held_scores(results / "study_unseen_kinds.json")
+    weights = held_scores(results / "study_channel_weights.json")
     written = 0
     for table in tables:
         held = held_scores(results / f"table_{table.replace('.', '_')}.json")

@@ -1,15 +1,19 @@
 r"""Plain statistics of the raw readings, from which a gate can tell that a sensor fails.
 
 Feature maps after normalization no longer hold what a failure changes most: level, contrast, the
-number of points. These are some fifty numbers of the picture and of the map, all of the order of 1:
+number of points. These are some sixty numbers of the picture and of the map, all of the order of 1:
 means and deviations, gradients and roughness, a histogram and its entropy, contrast of blocks;
-occupied cells by bearing and by depth, isolated ones, mean height and density.
+occupied cells by bearing and by depth, isolated ones, mean height and density. A few lost beams or
+degrees of the view hardly change any of these; they leave gaps in what is seen of the ground from
+ring to ring and of the scene from bearing to bearing.
 
 Source: statistics of natural scenes as measures of quality, Mittal, Moorthy, Bovik (2012); which of
 them is our choice.
 """
 
 from __future__ import annotations
+
+from typing import NamedTuple
 
 import jax
 import jax.numpy as jnp
@@ -21,8 +25,12 @@ from fusion.detection.geometry.bev import BevConfig
 _LEVELS = np.linspace(-0.4, 0.6, 9, dtype=np.float32)  # of grey, mean colour subtracted
 _BLOCKS = 8  # rows and columns of blocks
 _SECTORS, _BANDS = 8, 6
+_BEARINGS, _VIEW = 16, np.radians(38.0)  # parts of the view, its half
+_RINGS, _HEIGHT = 30, 1.73  # parts of the ground by the angle under which it lies; of the lidar [m]
+_NEAREST, _DEPTH = 4.0, 5.0  # [m] where the rings begin, how many times as far they end
+_GAPS = 7
 N_IMAGE = 3 + 3 + 6 + len(_LEVELS) + 1 + 4
-N_SCAN = _SECTORS + _BANDS + 8
+N_SCAN = _SECTORS + _BANDS + 8 + 2 * _GAPS
 
 
 def _log(x: Array) -> Array:
@@ -75,17 +83,70 @@ def image_statistics(image: Float[Array, "b h w 3"]) -> Float[Array, "b n"]:
     )
 
 
-def _parts(config: BevConfig) -> tuple[np.ndarray, np.ndarray]:
-    """`[cells, sectors]` and `[cells, bands]`: which bearing and depth every cell belongs to."""
+class _Part(NamedTuple):
+    """Which part every cell of a map belongs to.
+
+    Attributes:
+        index: `[cells]`, `n` for those of none.
+        n: number of parts that hold cells.
+    """
+
+    index: np.ndarray
+    n: int
+
+
+def _cut(values: np.ndarray, edges: np.ndarray) -> _Part:
+    """Cells between consecutive edges are a part; one without cells is none."""
+    part = np.searchsorted(edges, values.ravel(), side="right") - 1
+    inside = (part >= 0) & (part < len(edges) - 1)
+    held, index = np.unique(part[inside], return_inverse=True)
+    of_all = np.full(part.shape, len(held))
+    of_all[inside] = index
+    return _Part(of_all, len(held))
+
+
+class _Parts(NamedTuple):
+    """Cells by bearing, alike in number, and by depth; by bearing, alike in width, and by ring."""
+
+    sectors: _Part
+    bands: _Part
+    bearings: _Part
+    rings: _Part
+
+
+def _parts(config: BevConfig) -> _Parts:
     rows, columns = config.shape
     row, column = np.meshgrid(np.arange(rows), np.arange(columns), indexing="ij")
     z = config.z_range[1] - (row + 0.5) * config.cell
     x = config.x_range[0] + (column + 0.5) * config.cell
-    bearing = np.arctan2(x, np.maximum(z, 1e-3)).ravel()
-    edges = np.quantile(bearing, np.linspace(0, 1, _SECTORS + 1)[1:-1])
-    sector = np.searchsorted(edges, bearing)
-    band = row.ravel() * _BANDS // rows
-    return np.eye(_SECTORS, dtype=np.float32)[sector], np.eye(_BANDS, dtype=np.float32)[band]
+    bearing = np.arctan2(x, np.maximum(z, 1e-3))
+    within = np.quantile(bearing, np.linspace(0, 1, _SECTORS + 1)[1:-1])
+    near = max(_NEAREST, config.z_range[0])
+    low, high = (np.arctan2(_HEIGHT, end) for end in (_DEPTH * near, near))
+    return _Parts(
+        _Part(np.searchsorted(within, bearing.ravel()), _SECTORS),
+        _Part(row.ravel() * _BANDS // rows, _BANDS),
+        _cut(bearing, np.linspace(-_VIEW, _VIEW, _BEARINGS + 1)),
+        _cut(np.arctan2(_HEIGHT, np.hypot(x, z)), np.linspace(low, high, _RINGS + 1)),
+    )
+
+
+def _count(cells: Float[Array, "b c"], part: _Part) -> Float[Array, "b p"]:
+    """Sum over the cells of each part."""
+    sums = jax.ops.segment_sum(cells.T, jnp.asarray(part.index), part.n + 1)
+    return sums[:-1].T
+
+
+def _gaps(profile: Float[Array, "b p"]) -> Float[Array, "b g"]:
+    """How low and how uneven a profile is: what is lost in between its parts."""
+    if profile.shape[1] < 3:  # a map too coarse to show any
+        return jnp.zeros((profile.shape[0], _GAPS), profile.dtype)
+    step, bend = (jnp.abs(jnp.diff(profile, n, axis=1)) for n in (1, 2))
+    spread = jnp.sqrt(profile.var(axis=1) + 1e-8)
+    lowest = jnp.sort(profile, axis=1)[:, :3]
+    values = [lowest[:, 0], lowest.mean(axis=1), spread]
+    values += [step.mean(axis=1), bend.mean(axis=1), step.max(axis=1), bend.max(axis=1)]
+    return jnp.stack(values, axis=1)
 
 
 def scan_statistics(config: BevConfig, bev: Float[Array, "b r c s"]) -> Float[Array, "b n"]:
@@ -93,7 +154,11 @@ def scan_statistics(config: BevConfig, bev: Float[Array, "b r c s"]) -> Float[Ar
     b = bev.shape[0]
     occupied = (bev[..., -1] > 0).astype(bev.dtype)
     cells = occupied.reshape(b, -1)
-    sectors, bands = (jnp.log1p(cells @ jnp.asarray(part)) / 5.0 for part in _parts(config))
+    parts = _parts(config)
+    sectors, bands, bearings = (jnp.log1p(_count(cells, part)) / 5.0 for part in parts[:3])
+    ground = (bev[..., 0] > 0).astype(bev.dtype).reshape(b, -1)
+    size = np.bincount(parts.rings.index, minlength=parts.rings.n + 1)[:-1]
+    rings = _count(ground, parts.rings) / jnp.asarray(size, bev.dtype)[None]
     total = occupied.sum(axis=(1, 2))
     around = jax.lax.reduce_window(occupied, 0.0, jax.lax.add, (1, 3, 3), (1, 1, 1), "SAME")
     around = around - occupied
@@ -114,7 +179,7 @@ def scan_statistics(config: BevConfig, bev: Float[Array, "b r c s"]) -> Float[Ar
         ],
         axis=-1,
     )
-    return jnp.concatenate([sectors, bands, of_all], axis=-1)
+    return jnp.concatenate([sectors, bands, of_all, _gaps(bearings), _gaps(rings)], axis=-1)
 
 
 def quality_statistics(

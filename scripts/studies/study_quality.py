@@ -8,8 +8,8 @@ camera and a third a failing lidar, 1,500 steps of Adam), on the statistics as t
 and on their deviations from clean frames (`deviations`), with all kinds of failure and with each
 third of them left out. The untrained opponent is the mean squared deviation of the sensor
 (`distance`). Measured is the AUROC of the told log odds, working against failing sensors of one
-kind and severity; severities 1, 2 and 5 of 5. Writes `results/study_quality.json` (`_val` is added to
-tables of validation frames). Four CPU-minutes, most of it failures of 400 frames.
+kind and severity; severities 1, 2 and 5 of 5. Writes `results/study_quality.json` (`_val` is added
+to tables of validation frames). Four CPU-minutes, most of it failures of 400 frames.
 """
 
 from __future__ import annotations

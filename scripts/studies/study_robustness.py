@@ -5,6 +5,8 @@
     python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test
     python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test \
         --fold seed
+    python scripts/studies/study_robustness.py --data SIM --any-size --seeds 5 --split test \
+        --fold all --models dense
     python scripts/studies/study_robustness.py --data SIM --any-size --seeds 3 --split test \
         --models avod avod_argate --levels 1 3 5
 
@@ -21,9 +23,11 @@ where the cells of `dense` are not in `--out`, the corruption error is taken aga
 (0, 1), which path drop in training prepares it for.
 
 `--fold` leaves a third of the failures out of the training (0, 1, 2, or `seed` for the seed modulo
-three): the row `unseen kinds` is their mean, `seen kinds (folds)` that of the others. Every
-training and every cell is kept as it comes, seeds whole first, so the same command goes on after an
-interruption; `--collect-only` writes the table of what is there. Prints `result: ...` at the end.
+three): the row `unseen kinds` is their mean, `seen kinds (folds)` that of the others. With `all` no
+sensor fails in training, and rows end in `(none seen)`. `best_of_both` is the better of `dense`,
+`camera_only` and `lidar_only` in each cell, chosen afterwards: no switch between them has more.
+Every training and every cell is kept as it comes, seeds whole first, so the same command goes on
+after an interruption; `--collect-only` writes the table of what is there. Prints `result: ...`.
 """
 
 from __future__ import annotations
@@ -44,8 +48,8 @@ from snn_fusion_failure.commands.detector_cells import (
     read_frames,
     recorded_cells,
 )
-from snn_fusion_failure.commands.detector_robustness import summarize_cells
-from snn_fusion_failure.records.detector_folds import FOLDS
+from snn_fusion_failure.commands.detector_rows import METRICS, best_of, fold_rows
+from snn_fusion_failure.records.detector_folds import FOLDS, Fold, unseen_kinds
 from snn_fusion_failure.records.rows import Compared, column_cells, record_table
 from snn_fusion_failure.runs import print_result, repository, run_command
 
@@ -55,15 +59,17 @@ MODELS: tuple[choices.Model, ...] = (
 BASELINE: choices.Model = "dense"
 SINGLE = {"camera_only": (1.0, 0.0), "lidar_only": (0.0, 1.0)}
 """Detectors of one sensor, made from the trained baseline by fixed fusion weights."""
-Fold = Literal["none", "0", "1", "2", "seed"]
-METRICS = (METRIC, "weight_auroc", "failed_auroc")
+BOUND = "best_of_both"
+"""The better of `dense` and its single sensors in each cell, chosen afterwards."""
+FoldOption = Literal["none", "0", "1", "2", "seed", "all"]
 GROUPS = (
     "clean", "seen kinds", "misaligned", "clean (folds)", "seen kinds (folds)", "unseen kinds",
+    "clean (none seen)", "unseen kinds (none seen)",
 )  # fmt: skip
 """Rows that are compared seed by seed; single cells are too many to tell anything of each."""
 PAIRS = (
     ("dense_argate", "dense"), ("dense_oracle", "dense"), ("dense_oracle", "dense_argate"),
-    ("dense", "lidar_only"), ("avod_argate", "avod"),
+    ("dense", "lidar_only"), (BOUND, "dense"), ("avod_argate", "avod"),
 )  # fmt: skip
 
 
@@ -85,8 +91,10 @@ class Config:
     """Severities in fifths."""
     kinds: tuple[str, ...] = ()
     """Failures to evaluate; all when left out."""
-    fold: Fold = "none"
-    """Group of failures that training does not see."""
+    fold: FoldOption = "none"
+    """Group of failures that training does not see; `all`: no sensor fails in training."""
+    train_split: str = "train"
+    """List to train on, a shorter one to see what few frames do; with a `--name` of its own."""
     split: Literal["val", "test"] = "val"
     """Frames to evaluate: `val` to choose settings, `test` for the numbers of record."""
     overlap: float | None = None
@@ -109,7 +117,7 @@ class Training:
 
     model: choices.Model
     seed: int
-    fold: int | None
+    fold: Fold
 
     def folder(self, config: Config) -> Path:
         """Where it is kept."""
@@ -119,15 +127,15 @@ class Training:
     @property
     def unseen(self) -> tuple[str, ...]:
         """Kinds left out of the training."""
-        return () if self.fold is None else FOLDS[self.fold]
+        return unseen_kinds(self.fold)
 
 
 def trainings(config: Config) -> list[Training]:
     """What a command line trains, whole seeds first."""
 
-    def fold(seed: int) -> int | None:
-        if config.fold == "none":
-            return None
+    def fold(seed: int) -> Fold:
+        if config.fold in ("none", "all"):
+            return None if config.fold == "none" else "all"
         return seed % len(FOLDS) if config.fold == "seed" else int(config.fold)
 
     seeds = range(config.first_seed, config.first_seed + config.seeds)
@@ -158,7 +166,8 @@ def _options(config: Config, training: Training) -> choices.Train:
     seen = tuple(kind for kind in SENSOR_FAILURES if kind not in training.unseen)
     return choices.Train(
         config.data, training.model, config.size, config.cache, seed=training.seed,
-        steps=config.steps, failures=True, failure_kinds=seen if training.unseen else (),
+        steps=config.steps, split=config.train_split, failures=training.fold != "all",
+        failure_kinds=seen if training.unseen and seen else (),
         changes=config.changes, out=run, resume=(run / "config.json").exists(),
     )  # fmt: skip
 
@@ -181,8 +190,9 @@ def execute(config: Config) -> int:
     folder = runs.cache_folder(prepared)
     if not (folder / "cache.json").exists():
         command.prepare(prepared)
-    if config.split not in open_cache(folder).splits:
-        command.prepare(dataclasses.replace(prepared, splits=(config.split,), add=True))
+    for split in (config.train_split, config.split):
+        if split not in open_cache(folder).splits:
+            command.prepare(dataclasses.replace(prepared, splits=(split,), add=True))
     cache = open_cache(folder)
     frames = read_frames(config.data, cache, config.split)
     wanted, done = cells(config), 0
@@ -207,42 +217,6 @@ def execute(config: Config) -> int:
     return done
 
 
-def _means(found: dict[Cell, dict[str, float]], base: Any, kinds: Any) -> dict[str, float]:
-    """Scores over the cells of some kinds: means, mRA and, against the baseline, mCE."""
-
-    def by_kind(scores: dict[Cell, dict[str, float]]) -> dict[str, dict[str, float]]:
-        out: dict[str, dict[str, float]] = {}
-        for cell, values in scores.items():
-            if cell.failure is not None and cell.failure in kinds:
-                out.setdefault(cell.failure, {})[str(cell.level)] = values[METRIC]
-        return out
-
-    clean = found[Cell()][METRIC]
-    summary = summarize_cells(clean, by_kind(found), None if base is None else by_kind(base))
-    means = {METRIC: summary.pop("mean"), **summary}
-    for metric in METRICS[1:]:
-        values = [v[metric] for c, v in found.items() if c.failure in kinds and metric in v]
-        if values:
-            means[metric] = sum(values) / len(values)
-    return means
-
-
-def _rows_of(
-    training: Training, found: Any, base: Any, kinds: set[str | None]
-) -> dict[str, dict[str, float]]:
-    """Rows of one training: single cells where it saw all kinds, and means of groups."""
-    from fusion.detection.sensors import MISALIGNMENTS
-
-    apart, unseen = kinds & set(MISALIGNMENTS), kinds & set(training.unseen)
-    if training.fold is None:
-        rows = {cell.name: values for cell, values in found.items()}
-        groups = {"seen kinds": kinds - apart, "misaligned": apart}
-    else:
-        rows = {"clean (folds)": found[Cell()]}
-        groups = {"unseen kinds": unseen, "seen kinds (folds)": kinds - apart - unseen}
-    return rows | {row: _means(found, base, group) for row, group in groups.items() if group}
-
-
 def _table(config: Config) -> Path:
     name = config.name if config.split == "test" else f"{config.name}_val"
     return config.results / f"{name}.json"
@@ -253,11 +227,13 @@ def scores(config: Config) -> dict[tuple[str, str], dict[int, dict[str, float]]]
 
     Where a seed was trained with several folds, its value is their mean.
     """
+    from fusion.detection.sensors import MISALIGNMENTS
+
     wanted = cells(config)
-    kinds = {cell.failure for cell in wanted[1:]}
     held: dict[tuple[str, str], dict[int, list[dict[str, float]]]] = {}
     seeds = range(config.first_seed, config.first_seed + config.seeds)
-    for seed, fold in itertools.product(seeds, (None, *range(len(FOLDS)))):
+    folds: tuple[Fold, ...] = (None, *range(len(FOLDS)), "all")
+    for seed, fold in itertools.product(seeds, folds):
         baseline = Training(BASELINE, seed, fold).folder(config) / f"cells_{config.split}"
         base = read_cells(baseline, wanted)
         if base is None and fold is None:
@@ -265,11 +241,12 @@ def scores(config: Config) -> dict[tuple[str, str], dict[int, dict[str, float]]]
         # Models of another command keep their rows and the command that made them.
         for model in config.models:
             training = Training(model, seed, fold)
-            for name, _, kept in _variants(config, training):
-                found = read_cells(kept, wanted)
-                for row, values in (
-                    _rows_of(training, found, base, kinds) if found else {}
-                ).items():
+            found = {n: read_cells(kept, wanted) for n, _, kept in _variants(config, training)}
+            whole = {name: scores for name, scores in found.items() if scores}
+            if model == BASELINE and len(whole) == len(found):
+                whole[BOUND] = best_of(list(whole.values()))
+            for name, measured in whole.items():
+                for row, values in fold_rows(fold, measured, base, MISALIGNMENTS).items():
                     held.setdefault((row, name), {}).setdefault(seed, []).append(values)
     return {
         key: {

@@ -42,6 +42,7 @@ def test_every_kind_is_left_out_once() -> None:
     assert sorted(kind for fold in study.FOLDS for kind in fold) == sorted(SENSOR_FAILURES)
     for fold in study.FOLDS:
         assert {kind.partition("_")[0] for kind in fold} == {"camera", "lidar"}
+    assert sorted(study.unseen_kinds("all")) == sorted(SENSOR_FAILURES)
     config = study.Config(Path("x"), seeds=2, models=("dense", "avod"), fold="seed")
     names = [training.folder(config).name for training in study.trainings(config)]
     assert names == ["dense_fold0_s0", "avod_fold0_s0", "dense_fold1_s1", "avod_fold1_s1"]
@@ -92,6 +93,33 @@ def test_rows_are_means_of_the_cells(tmp_path: Path) -> None:
     assert not any("fog" in row for row, _ in found)
     assert found["seen kinds", "dense_argate - dense"] == pytest.approx(6.5)
     assert found["clean", "dense_argate - dense"] == pytest.approx(10.0)
+
+
+def test_trainings_that_see_no_failure_have_rows_of_their_own_and_a_bound(tmp_path: Path) -> None:
+    config = _config(tmp_path, models=("dense",), fold="all")
+    cells = study.cells(config)
+    variants = {
+        "": (50, 40, 30, 20, 10),
+        "_lidar_only": (45, 45, 45, 5, 2),
+        "_camera_only": (1,) * 5,
+    }
+    [training, _] = study.trainings(config)
+    assert training.folder(config).name == "dense_foldall_s0"
+    for name, values in variants.items():
+        for cell, value in zip(cells, values, strict=True):
+            _write(training.folder(config) / f"cells_test{name}", cell, value, (0.5, 0.5))
+    study.main(config)
+    table = json.loads((tmp_path / "results" / "study_robustness.json").read_text())
+    held = {(r["row"], r["model"], r["metric"]): r["values"] for r in table["rows"]}
+    of = {(row, model): v for (row, model, metric), v in held.items() if metric == study.METRIC}
+    assert all(row.endswith("(none seen)") for row, _ in of)
+    assert of["camera_fog 5 (none seen)", "dense"] == [30]
+    assert of["unseen kinds (none seen)", "dense"] == [25]
+    assert of["camera_fog 5 (none seen)", "best_of_both"] == [45]
+    assert of["unseen kinds (none seen)", "best_of_both"] == [(45 + 15) / 2]
+    options = study._options(config, training)
+    cache = SimpleNamespace(size="small", config=lambda model: preset("small", model).config)
+    assert runs.build(options, cache).train.failure_share == 0.0
 
 
 def test_each_model_is_trained_as_long_as_its_preset_says(tmp_path: Path) -> None:

@@ -87,11 +87,11 @@ class _Part(NamedTuple):
     """Which part every cell of a map belongs to.
 
     Attributes:
-        index: `[cells]`, `n` for those of none.
+        of_cell: `[cells]`, `n` for those of none.
         n: number of parts that hold cells.
     """
 
-    index: np.ndarray
+    of_cell: np.ndarray
     n: int
 
 
@@ -133,7 +133,7 @@ def _parts(config: BevConfig) -> _Parts:
 
 def _count(cells: Float[Array, "b c"], part: _Part) -> Float[Array, "b p"]:
     """Sum over the cells of each part."""
-    sums = jax.ops.segment_sum(cells.T, jnp.asarray(part.index), part.n + 1)
+    sums = jax.ops.segment_sum(cells.T, jnp.asarray(part.of_cell), part.n + 1)
     return sums[:-1].T
 
 
@@ -157,7 +157,7 @@ def scan_statistics(config: BevConfig, bev: Float[Array, "b r c s"]) -> Float[Ar
     parts = _parts(config)
     sectors, bands, bearings = (jnp.log1p(_count(cells, part)) / 5.0 for part in parts[:3])
     ground = (bev[..., 0] > 0).astype(bev.dtype).reshape(b, -1)
-    size = np.bincount(parts.rings.index, minlength=parts.rings.n + 1)[:-1]
+    size = np.bincount(parts.rings.of_cell, minlength=parts.rings.n + 1)[:-1]
     rings = _count(ground, parts.rings) / jnp.asarray(size, bev.dtype)[None]
     total = occupied.sum(axis=(1, 2))
     around = jax.lax.reduce_window(occupied, 0.0, jax.lax.add, (1, 3, 3), (1, 1, 1), "SAME")

@@ -117,6 +117,8 @@ class DetectorConfig:
         label_smoothing, regression_weight, angle_weight: of the losses.
         gate_loss, targets: terms of Equation 3.2, see `fusion.losses`.
         auxiliary_second: the auxiliary paths of the views go on through the second stage.
+        auxiliary_trains_views: the auxiliary losses train the views beside their own heads; `dense`
+            models can do without, as paths of `avod` have no heads of their own.
         balanced_paths: the class losses of these paths weigh positives and negatives alike, and
             the targets see how far their mean lies above its running mean for the view, in frames
             with positives; else class losses are means over the mini-batch and the targets see the
@@ -173,6 +175,7 @@ class DetectorConfig:
         default_factory=lambda: TargetConfig(loss_range=(0.0, 2.0))
     )
     auxiliary_second: bool = True
+    auxiliary_trains_views: bool = True
     balanced_paths: bool = True
     fixed_weights: tuple[float, float] | None = None
 
@@ -228,6 +231,11 @@ class DetectorConfig:
             raise ValueError(
                 f"fixed_weights={self.fixed_weights}: expected none with model={self.model!r}; the "
                 "dense models can do without a sensor"
+            )
+        if not (self.auxiliary_trains_views or self.is_dense):
+            raise ValueError(
+                f"auxiliary_trains_views=False: expected True with model={self.model!r}, whose "
+                "paths share the network's heads; take dense_argate"
             )
         for name in ("dropout", "path_drop"):
             if not 0 <= getattr(self, name) < 1:

@@ -79,11 +79,10 @@ def score_told(told: Mapping[tuple[str, int], Any], calibration: Any = None) -> 
 def _as_told(p: Any, calibration: Any, sensor: int) -> Any:
     """Probabilities before a calibration."""
     import numpy as np
+    from scipy.special import expit, logit
 
     slope, offset = float(calibration.slope[sensor]), float(calibration.offset[sensor])
-    inside = np.clip(p, 1e-9, 1.0 - 1e-9)
-    log_odds = (np.log(inside / (1.0 - inside)) - offset) / slope
-    return 0.5 * (1.0 + np.tanh(0.5 * log_odds))
+    return expit((logit(np.clip(p, 1e-9, 1.0 - 1e-9)) - offset) / slope)
 
 
 def print_told(scored: Mapping[str, Any], levels: Sequence[int]) -> None:

@@ -13,7 +13,7 @@ import pytest
 from fusion.detection.config import DenseConfig, DetectorConfig
 from fusion.detection.geometry.bev import BevConfig
 from fusion.detection.kitti.objects import concatenate, select
-from fusion.detection.learning.dense_objective import grid_losses
+from fusion.detection.learning.dense_objective import dense_loss, grid_losses
 from fusion.detection.learning.dense_targets import (
     GridTargets,
     average_cells,
@@ -236,6 +236,28 @@ def test_low_precision_is_the_same_network_rounded() -> None:
     error = np.abs(exact - low)
     # Eight bits of mantissa: a rounding of 0.4 % in every layer.
     assert 1e-4 < error.max() < 0.05 and np.abs(exact).max() > 1.0
+
+
+@pytest.mark.slow
+def test_auxiliary_losses_train_the_views_only_where_they_are_asked_to() -> None:
+    example, _ = make_example(TINY, a_frame())
+    x = jax.tree.map(lambda a: a[None], jax.jit(partial(make_inputs, TINY))(example))
+    rates = DetectorParams()
+    for trains in (True, False):
+        config = dataclasses.replace(TINY, auxiliary_trains_views=trains)
+        params, stats = jax.jit(partial(init_detector, config=config))(jax.random.key(0))
+        loss = jax.grad(partial(dense_loss, config), argnums=1, has_aux=True)
+        slope = jax.jit(partial(loss, stats=stats, inputs=x, key=jax.random.key(1)))
+        whole, without = (
+            slope(rates._replace(gate=rates.gate._replace(alpha=alpha)), params)[0]
+            for alpha in (1.0, 0.0)
+        )
+        same = jax.tree.map(np.array_equal, whole["main"]["near_0"], without["main"]["near_0"])
+        assert all(jax.tree.leaves(same)) != trains
+        heads = jax.tree.leaves(whole["auxiliary"])
+        assert any(np.abs(leaf).max() > 0 for leaf in heads)
+    with pytest.raises(ValueError, match="expected True with model='avod_argate'"):
+        dataclasses.replace(TINY, model="avod_argate", auxiliary_trains_views=False)
 
 
 @pytest.mark.relaxed

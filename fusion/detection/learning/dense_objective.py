@@ -96,7 +96,10 @@ def dense_loss(
     gate = of_paths = regularization = jnp.zeros(())
     if config.gated:
         heads: Any = DenseAuxiliary(config)
-        views = heads.apply({"params": params["auxiliary"]}, grids.camera, grids.lidar)
+        read = grids.camera, grids.lidar
+        if not config.auxiliary_trains_views:
+            read = jax.lax.stop_gradient(read)
+        views = heads.apply({"params": params["auxiliary"]}, *read)
         parts = [grid_losses(view, targets) for view in views]
         whole = [h + config.regression_weight * o for h, o, _ in parts]
         counted = targets.centre.any(axis=(1, 2)).astype(jnp.float32)

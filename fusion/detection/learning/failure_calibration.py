@@ -8,6 +8,7 @@ from typing import Any, NamedTuple
 
 import jax
 import numpy as np
+from scipy.special import expit
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.learning.examples import Example
@@ -129,8 +130,8 @@ def calibrate_log_odds(
     for k in range(2):
         told, truth = log_odds[..., k], failed[..., k].ravel()
         slope, offset = fit_platt(told.ravel(), truth)
-        before = _sigmoid(told)
-        after = _sigmoid(slope * told + offset)
+        before = expit(told)
+        after = expit(slope * told + offset)
         fits.append((slope, offset, alarm_threshold(after[:, 0], false_alarm_rate)))
         scores.append(
             [
@@ -175,7 +176,3 @@ def calibrate_told_failures(
         alarm_threshold(np.zeros(n_frames), false_alarm_rate)
     told, failed = read_log_odds(config, state, n_frames, read, kinds=kinds, seed=seed)
     return calibrate_log_odds(told, failed, false_alarm_rate)
-
-
-def _sigmoid(x: np.ndarray) -> np.ndarray:
-    return 0.5 * (1.0 + np.tanh(0.5 * x))

@@ -20,6 +20,7 @@ from typing import NamedTuple
 import jax.numpy as jnp
 import numpy as np
 from jaxtyping import Array, Bool, Float
+from scipy.special import expit
 
 _ITERATIONS = 60
 _DAMPING = 1e-9  # of Newton's steps; log odds are scaled to a deviation of 1
@@ -98,7 +99,7 @@ def fit_platt(
 
     w = flat
     for _ in range(_ITERATIONS):
-        p = 1 / (1 + np.exp(-design @ w))
+        p = expit(design @ w)
         gradient = design.T @ (p - target) / len(x)
         curvature = (design.T * (p * (1 - p))) @ design / len(x) + _DAMPING * np.eye(2)
         step, factor = np.linalg.solve(curvature, gradient), 1.0

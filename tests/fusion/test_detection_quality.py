@@ -12,6 +12,7 @@ import pytest
 
 from fusion.detection.geometry import BevConfig, bev_maps
 from fusion.detection.learning.gate_objective import failure_loss
+from fusion.detection.network import QualityHead
 from fusion.detection.sensors import (
     CAMERA_FAILURES,
     LIDAR_FAILURES,
@@ -141,6 +142,23 @@ def test_what_tells_noisy_ranges_and_blur_moves_as_far_as_other_statistics_do() 
     blurred = (np.roll(sharp, 1, axis=2) + sharp + np.roll(sharp, -1, axis=2)) / 3.0
     found = np.asarray(image_statistics(jnp.asarray(np.concatenate([sharp, blurred]))))
     assert found[0, 10] - found[1, 10] > 0.5
+
+
+def test_a_reading_farther_from_clean_ones_never_looks_healthier() -> None:
+    head, rng = QualityHead(), np.random.default_rng(0)
+    near = tuple(jnp.asarray(rng.uniform(0, 1, (64, n)), jnp.float32) for n in (5, 3))
+    fresh = head.init(jax.random.key(0), near)
+    drawn = jax.tree.map(lambda a: jnp.asarray(rng.normal(0, 3, a.shape), jnp.float32), fresh)
+    # Any one statistic moves, in a sensor whose weights are of any sign.
+    far = tuple(x.at[:, 1].add(0.5) for x in near)
+    odds = [np.asarray(head.apply(drawn, x)) for x in (near, far, (far[0], near[1]))]
+    assert (odds[1] > odds[0]).all()
+    np.testing.assert_array_equal(
+        odds[2][:, 1], odds[0][:, 1]
+    )  # one sensor does not tell of others
+    # Before training it is the distance, and says "works" of a reading as clean ones are.
+    distance = np.stack([(np.asarray(x) ** 2).sum(1) for x in near], axis=1)
+    np.testing.assert_allclose(head.apply(fresh, near), np.log(2) * distance - 4, rtol=1e-5)
 
 
 def test_statistics_pass_no_gradient_and_labels_count_where_they_are_known() -> None:

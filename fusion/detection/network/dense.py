@@ -35,7 +35,7 @@ from fusion.targets import init_targets
 # Heat; x, z, height from the ground; log length, width, height; cos, sin of axis and of heading.
 N_OUTPUTS = 11
 _RARE = -4.0  # log odds of a centre to begin with
-_OUTPUTS = {"fusion": 0.0, "failed": 0.01, "boxes": 0.01}
+_OUTPUTS = {"fusion": 0.0, "boxes": 0.01}
 
 
 class Grids(NamedTuple):
@@ -116,7 +116,7 @@ class DenseDetector(nn.Module):
             if c.gate_statistics:
                 self.clean = CleanReadings()
             if c.gated and c.gate_statistics:
-                self.quality = QualityHead(c.gate_width)
+                self.quality = QualityHead()
         top, low = d.trunk_widths
         self.fused = [block(top), block(top)]
         self.down = [block(low, 2), block(low), block(low)]
@@ -145,15 +145,16 @@ class DenseDetector(nn.Module):
             return Grids(camera, lidar, jnp.full((b, 2), 0.5), failed)
         # The gate reads the views and does not train them.
         views = jax.lax.stop_gradient((camera, lidar))
-        statistics = None
+        away: tuple[Array, ...] = ()
         if self.config.gate_statistics:
-            statistics = self.clean(quality_statistics(self.config.bev, inputs.image, inputs.bev))
+            away = self.clean(quality_statistics(self.config.bev, inputs.image, inputs.bev))
         if self.config.is_oracle:
-            return Grids(camera, lidar, self.gate(views, statistics, _told(inputs.told)), failed)
-        if statistics is None:
+            weights = self.gate(views, _told(inputs.told), away)
+            return Grids(camera, lidar, weights, failed)
+        if not away:
             return Grids(camera, lidar, self.gate(views), failed)
-        failed = self.quality(statistics)
-        return Grids(camera, lidar, self.gate(views, statistics, failed), failed)
+        failed = self.quality(away)
+        return Grids(camera, lidar, self.gate(views, failed), failed)
 
     def head(self, grids: Grids, scale: Float[Array, "b 2"]) -> Float[Array, "b r s 11"]:
         """Heat (log odds) and box of every cell from the scaled views."""

@@ -26,7 +26,7 @@ SENSORS = ("camera", "lidar")
 # Output layers start small: even class scores, boxes at their anchors. The gate's starts at zero,
 # so that training starts from equal weights, as AVOD fuses.
 _OUTPUTS = {
-    "objectness": 0.01, "offsets": 0.01, "classes": 0.01, "angle": 0.01, "failed": 0.01,
+    "objectness": 0.01, "offsets": 0.01, "classes": 0.01, "angle": 0.01,
     "fusion": 0.0,
 }  # fmt: skip
 
@@ -64,7 +64,7 @@ class Detector(nn.Module):
             self.gate = MapGate(c.gate_width, c.normalizer)
             if c.gate_statistics:
                 self.clean = CleanReadings()
-                self.quality = QualityHead(c.gate_width)
+                self.quality = QualityHead()
         self.rpn = RpnHead(c.rpn_width, c.dropout)
         self.second = SecondHead(c.fc_widths, c.dropout)
 
@@ -80,9 +80,8 @@ class Detector(nn.Module):
             return Encoded((camera, lidar), maps, jnp.full((image.shape[0], 2), 0.5), failed)
         if not self.config.gate_statistics:
             return Encoded((camera, lidar), maps, self.gate(maps), failed)
-        statistics = self.clean(quality_statistics(self.config.bev, image, bev))
-        failed = self.quality(statistics)
-        return Encoded((camera, lidar), maps, self.gate(maps, statistics, failed), failed)
+        failed = self.quality(self.clean(quality_statistics(self.config.bev, image, bev)))
+        return Encoded((camera, lidar), maps, self.gate(maps, failed), failed)
 
     def first_stage(self, crops: Array, train: bool) -> tuple[Array, Array]:
         """`RpnHead` on fused crops of the one-channel maps."""

@@ -11,6 +11,8 @@ from fusion.detection.sensors.deviation import Clean, deviations
 from fusion.gating import Normalizer, normalize
 
 _LEAK = 0.1
+_RARE = 4.0  # log odds that a sensor works whose readings are as clean ones in the mean
+_SENSORS = ("camera", "lidar")
 
 
 class RpnHead(nn.Module):
@@ -49,43 +51,61 @@ class CleanReadings(nn.Module):
     """
 
     @nn.compact
-    def __call__(self, statistics: tuple[Array, ...]) -> Float[Array, "b n"]:
-        """`deviations` of all sensors, in their order."""
+    def __call__(self, statistics: tuple[Array, ...]) -> tuple[Array, ...]:
+        """`deviations` `[b, n]` of each sensor, in their order."""
         found = []
-        for sensor, given in zip(("camera", "lidar"), statistics, strict=True):
+        for sensor, given in zip(_SENSORS, statistics, strict=True):
             n = given.shape[-1]
             mean = self.param(f"{sensor}_mean", nn.initializers.zeros, (n,))
             whiten = self.param(f"{sensor}_whiten", lambda _, shape: jnp.eye(shape[0]), (n, n))
             found.append(deviations(Clean(mean, whiten), given))
-        return jnp.concatenate(found, axis=-1)
+        return tuple(found)
 
 
 class QualityHead(nn.Module):
-    """Logits of each sensor's failure from the deviations of its readings."""
+    r"""Log odds that a sensor has failed: a weighted squared distance from clean readings.
 
-    width: int
+    .. math:: \ell_k = \sum_i \log(1 + e^{a_{ki}}) \, q_{ki}^2 + b_k - 4
+
+    :math:`q_{ki}` are the deviations of sensor k. No weight is negative, so that a reading farther
+    from clean ones never looks healthier, in a way that no failure of the training was, either;
+    equal weights, which training begins with, are the plain distance.
+
+    Source: ours; a logistic regression that is monotonic as the lattice of the targets is.
+    """
 
     @nn.compact
-    def __call__(self, statistics: Float[Array, "b n"]) -> Float[Array, "b 2"]:
+    def __call__(self, away: tuple[Float[Array, "b _"], ...]) -> Float[Array, "b 2"]:
         """Log odds that (camera, lidar) has failed."""
-        hidden = nn.leaky_relu(nn.Dense(self.width, name="quality")(statistics), _LEAK)
-        return nn.Dense(2, name="failed")(hidden)
+        zeros, found = nn.initializers.zeros, []
+        for sensor, q in zip(_SENSORS, away, strict=True):
+            weights = self.param(f"{sensor}_weights", zeros, (q.shape[-1],))
+            offset = self.param(f"{sensor}_bias", zeros, ())
+            found.append(q**2 @ jax.nn.softplus(weights) + offset - _RARE)
+        return jnp.stack(found, axis=-1)
+
+
+def _bounded(log_odds: Array) -> Array:
+    """What a gate reads of log odds: no failure is more of one than e^4 to 1; without gradient."""
+    return jax.lax.stop_gradient(jnp.clip(log_odds, -_RARE, _RARE))
 
 
 class MapGate(nn.Module):
     r"""Fusion weights of a frame from the one-channel map of each view and the raw readings.
 
-    .. math:: w = N\Big(W_o \, \big[\mathrm{lrelu}\big(\textstyle\sum_k W_k p_k + b_k + W_q q\big),
+    .. math:: w = N\Big(W_o \, \big[\mathrm{lrelu}\big(\textstyle\sum_k W_k p_k + b_k\big),
         \ell\big] + b_o\Big)
 
     :math:`p_k` are mean and standard deviation over the map of view k after two strided
-    convolutions, :math:`q` the deviations of the raw readings (`CleanReadings`),
-    :math:`\ell` the log odds of failures that `QualityHead` reads from them, :math:`N` the
-    normalizer; rectifiers are leaky, since a gate whose few units have died weighs all frames
-    alike. `init_detector` starts the last layer at zero, that is from equal weights, as AVOD fuses.
+    convolutions, :math:`\ell` the log odds of failures that `QualityHead` reads from the
+    deviations of the raw readings (`CleanReadings`), at most 4 in size, :math:`N` the normalizer;
+    rectifiers are leaky, since a gate whose few units have died weighs all frames alike.
+    `init_detector` starts the last layer at zero, that is from equal weights, as AVOD fuses.
 
     Source: Shim (2020), section 3.3.2.2 and Figure 3.6 (the layers' sizes are not given).
-    Deviation: the statistics; normalized maps do not hold what a failure changes most.
+    Deviation: the log odds; normalized maps do not hold what a failure changes most. The gate reads
+    no deviations beside them: what it made of ones that no failure of the training moved would be
+    chance.
     """
 
     width: int
@@ -95,7 +115,6 @@ class MapGate(nn.Module):
     def __call__(
         self,
         maps: tuple[Array, ...],
-        statistics: Float[Array, "b n"] | None = None,
         failed: Float[Array, "b k"] | None = None,
     ) -> Float[Array, "b k"]:
         """Weights of the views for every frame."""
@@ -107,11 +126,9 @@ class MapGate(nn.Module):
             spread = jnp.sqrt(x.var(axis=(1, 2)) + 1e-6)
             pooled = jnp.concatenate([x.mean(axis=(1, 2)), spread], axis=-1)
             hidden = hidden + nn.Dense(self.width, name=f"view{k}")(pooled)
-        if statistics is not None:
-            hidden = hidden + nn.Dense(self.width, name="statistics")(statistics)
         hidden = nn.leaky_relu(hidden, _LEAK)
         if failed is not None:
-            hidden = jnp.concatenate([hidden, jax.lax.stop_gradient(failed)], axis=-1)
+            hidden = jnp.concatenate([hidden, _bounded(failed)], axis=-1)
         last = nn.Dense(len(maps), name="fusion")
         return normalize(last(hidden), self.normalizer)
 
@@ -129,17 +146,18 @@ class GridGate(nn.Module):
     def __call__(
         self,
         grids: tuple[Array, ...],
-        statistics: Float[Array, "b n"] | None = None,
         failed: Float[Array, "b t"] | None = None,
+        away: tuple[Array, ...] = (),
     ) -> Float[Array, "b k"]:
-        """Weights of the views for every frame; the oracle's gate is told more than log odds."""
+        """Weights of the views for every frame; the oracle's gate is told more than log odds, and
+        reads the deviations, too."""
         parts = [x.mean(axis=(1, 2)) for x in grids]
         parts += [jnp.sqrt(x.var(axis=(1, 2)) + 1e-6) for x in grids]
-        parts += [] if statistics is None else [statistics]
+        parts += away
         hidden = nn.Dense(self.width, name="views")(jnp.concatenate(parts, axis=-1))
         hidden = nn.leaky_relu(hidden, _LEAK)
         if failed is not None:
-            hidden = jnp.concatenate([hidden, jax.lax.stop_gradient(failed)], axis=-1)
+            hidden = jnp.concatenate([hidden, _bounded(failed)], axis=-1)
         return normalize(nn.Dense(len(grids), name="fusion")(hidden), self.normalizer)
 
 

@@ -87,10 +87,12 @@ def _dense(size: str, made: DetectorSetup) -> DetectorSetup:
         train = dataclasses.replace(train, steps=6000, batch_size=2)
     else:
         dense = DenseConfig(lidar_width=8, camera_widths=(4, 8), trunk_widths=(8, 8), candidates=16)
-    # AVOD's own; with 0.3, half of the frames lack a view that works (docs/kitti.md has both).
+    # Path drop: AVOD's own; with 0.3, half of the frames lack a view that works. Views that the
+    # auxiliary losses train as well are worse ones for the trunk (docs/kitti.md has both).
     config = dataclasses.replace(
-        config, dense=dense, regression_weight=1.0, norm="group", path_drop=0.1
-    )
+        config, dense=dense, regression_weight=1.0, norm="group", path_drop=0.1,
+        auxiliary_trains_views=False,
+    )  # fmt: skip
     return DetectorSetup(config, train, rates._replace(clip_norm=5.0))
 
 

@@ -189,6 +189,7 @@ def test_the_gate_adds_less_than_two_percent() -> None:
 def test_few_training_frames_lack_a_view() -> None:
     for model in ("dense", "dense_argate", "dense_oracle"):
         assert preset("small", model).config.path_drop == 0.1
+        assert not preset("small", model).config.auxiliary_trains_views
     assert preset("small", "avod").config.path_drop == 0.3
 
 

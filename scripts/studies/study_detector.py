@@ -8,9 +8,9 @@ trains both models on the same frames with the same failures (one sensor fails i
 them), evaluates them on the validation list with all sensors working and with each failure, and
 writes `results/study_detector.json`. Settings are chosen on that list; `--split test` evaluates the
 same runs on frames that no choice has seen and writes `results/study_detector_test.json`. (The
-numbers of record of both models, with severities, are those of `study_robustness.py`.) Every training and every evaluation is kept as it comes, so the same command goes on
-after an interruption. About 8 CPU-minutes a training and 0.15 CPU-seconds a frame and evaluation
-(`small`).
+numbers of record of both models, with severities, are those of `study_robustness.py`.) Every
+training and every evaluation is kept as it comes, so the same command goes on after an
+interruption. About 8 CPU-minutes a training and 0.15 CPU-seconds a frame and evaluation (`small`).
 
     python scripts/studies/study_detector.py --real --data KITTI --cache CACHE --seeds 1 --steps 600
 

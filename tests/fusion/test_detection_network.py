@@ -443,7 +443,8 @@ def test_training_steps_resumes_and_detects(example: Example, tmp_path: Path) ->
     assert found[0].mask.any() and np.isfinite(found[0].boxes).all()
     np.testing.assert_allclose(found[0].weights.sum(), 1.0, rtol=1e-5)
     assert ((found[0].failed > 0) & (found[0].failed < 1)).all()
-    assert whole.history[0]["failure"] == pytest.approx(np.log(2), abs=0.1)
+    # The head begins as the distance from clean readings, which tells more than a coin does.
+    assert 0.0 < whole.history[0]["failure"] < np.log(2)
     # A dead lidar leaves the camera's proposals.
     dead = run_detector(TINY, whole.state, [example], failure="lidar_loss")
     assert dead[0].mask.any()

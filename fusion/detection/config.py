@@ -101,8 +101,8 @@ class DetectorConfig:
         rpn_width, rpn_crop: units of the first stage's two towers, side of its crops.
         fc_widths, second_crop: fully connected layers of the second stage, side of its crops.
         gate_width: hidden units of the gate; normalizer: of the fusion weights.
-        gate_statistics: the gate reads statistics of the raw picture and map beside the feature
-            maps, and tells the probability that each sensor has failed.
+        gate_statistics: the gate tells from statistics of the raw picture and map how probably each
+            sensor has failed, and reads that beside the feature maps.
         dropout: in both stages' heads; path_drop: probability to drop a view in training.
         rpn_batch, rpn_iou: mini-batch of anchors; ground overlap below which an anchor is negative
             and from which it is positive.
@@ -117,8 +117,8 @@ class DetectorConfig:
         label_smoothing, regression_weight, angle_weight: of the losses.
         gate_loss, targets: terms of Equation 3.2, see `fusion.losses`.
         auxiliary_second: the auxiliary paths of the views go on through the second stage.
-        auxiliary_trains_views: the auxiliary losses train the views beside their own heads; `dense`
-            models can do without, as paths of `avod` have no heads of their own.
+        auxiliary_trains_views: the auxiliary losses train the views beside their own heads, as in
+            the source; `dense` models can do without.
         balanced_paths: the class losses of these paths weigh positives and negatives alike, and
             the targets see how far their mean lies above its running mean for the view, in frames
             with positives; else class losses are means over the mini-batch and the targets see the
@@ -234,8 +234,8 @@ class DetectorConfig:
             )
         if not (self.auxiliary_trains_views or self.is_dense):
             raise ValueError(
-                f"auxiliary_trains_views=False: expected True with model={self.model!r}, whose "
-                "paths share the network's heads; take dense_argate"
+                f"auxiliary_trains_views=False: expected True with model={self.model!r}; the dense "
+                "models can do without"
             )
         for name in ("dropout", "path_drop"):
             if not 0 <= getattr(self, name) < 1:

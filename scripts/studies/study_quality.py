@@ -116,11 +116,14 @@ def network() -> Any:
 
 def monotonic(n_image: int) -> Any:
     """The detector's head, on deviations of both sensors side by side."""
+    import flax.linen as nn
+
     from fusion.detection.network.heads import QualityHead
 
-    class Split(QualityHead):
+    class Split(nn.Module):
+        @nn.compact
         def __call__(self, x: Any) -> Any:
-            return QualityHead.__call__(self, (x[..., :n_image], x[..., n_image:]))
+            return QualityHead()((x[..., :n_image], x[..., n_image:]))
 
     return Split()
 

@@ -153,9 +153,8 @@ def test_a_reading_farther_from_clean_ones_never_looks_healthier() -> None:
     far = tuple(x.at[:, 1].add(0.5) for x in near)
     odds = [np.asarray(head.apply(drawn, x)) for x in (near, far, (far[0], near[1]))]
     assert (odds[1] > odds[0]).all()
-    np.testing.assert_array_equal(
-        odds[2][:, 1], odds[0][:, 1]
-    )  # one sensor does not tell of others
+    # One sensor does not tell of others.
+    np.testing.assert_array_equal(odds[2][:, 1], odds[0][:, 1])
     # Before training it is the distance, and says "works" of a reading as clean ones are.
     distance = np.stack([(np.asarray(x) ** 2).sum(1) for x in near], axis=1)
     np.testing.assert_allclose(head.apply(fresh, near), np.log(2) * distance - 4, rtol=1e-5)

@@ -16,13 +16,19 @@ from jaxtyping import Array, Float, PRNGKeyArray
 
 from fusion.detection.config import DetectorConfig
 from fusion.detection.network.crop import crop_and_resize
-from fusion.detection.network.heads import CleanReadings, MapGate, QualityHead, RpnHead, SecondHead
+from fusion.detection.network.heads import (
+    SENSORS,
+    CleanReadings,
+    MapGate,
+    QualityHead,
+    RpnHead,
+    SecondHead,
+)
 from fusion.detection.network.initialize import init_weights
 from fusion.detection.network.views import FeaturePyramid
 from fusion.detection.sensors.quality import quality_statistics
 from fusion.targets import init_targets
 
-SENSORS = ("camera", "lidar")
 # Output layers start small: even class scores, boxes at their anchors. The gate's starts at zero,
 # so that training starts from equal weights, as AVOD fuses.
 _OUTPUTS = {

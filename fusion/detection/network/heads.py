@@ -12,7 +12,7 @@ from fusion.gating import Normalizer, normalize
 
 _LEAK = 0.1
 _RARE = 4.0  # log odds that a sensor works whose readings are as clean ones in the mean
-_SENSORS = ("camera", "lidar")
+SENSORS = ("camera", "lidar")
 
 
 class RpnHead(nn.Module):
@@ -54,7 +54,7 @@ class CleanReadings(nn.Module):
     def __call__(self, statistics: tuple[Array, ...]) -> tuple[Array, ...]:
         """`deviations` `[b, n]` of each sensor, in their order."""
         found = []
-        for sensor, given in zip(_SENSORS, statistics, strict=True):
+        for sensor, given in zip(SENSORS, statistics, strict=True):
             n = given.shape[-1]
             mean = self.param(f"{sensor}_mean", nn.initializers.zeros, (n,))
             whiten = self.param(f"{sensor}_whiten", lambda _, shape: jnp.eye(shape[0]), (n, n))
@@ -78,7 +78,7 @@ class QualityHead(nn.Module):
     def __call__(self, away: tuple[Float[Array, "b _"], ...]) -> Float[Array, "b 2"]:
         """Log odds that (camera, lidar) has failed."""
         zeros, found = nn.initializers.zeros, []
-        for sensor, q in zip(_SENSORS, away, strict=True):
+        for sensor, q in zip(SENSORS, away, strict=True):
             weights = self.param(f"{sensor}_weights", zeros, (q.shape[-1],))
             offset = self.param(f"{sensor}_bias", zeros, ())
             found.append(q**2 @ jax.nn.softplus(weights) + offset - _RARE)
